@@ -8,7 +8,7 @@ Each in one process on the same work, compilation apart. Memory is what XLA sets
 - `mg.rollout`: our step, lean carry; on scenes with many contacts that could be, also with room for the nearest alone.
 - `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
-- `engine="mujoco"`: `mg.rollout` that has C MuJoCo do it, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
+- `mg.Discrete("mujoco")`: `mg.rollout` by C MuJoCo, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
 - `MuJoCo Warp`: its step, captured as a graph on a GPU; where warp-lang is installed (`pip install warp-lang`).
 
 With several batches it also draws the steps per second of the forward rows against them, runs/bench.png.
@@ -71,10 +71,10 @@ _NUM_STEPS = 100
 # Made when they are asked for: an array would begin JAX before `--per-core` is read.
 _WAYS: dict[str, Callable[[], dict[str, Any]]] = {
     "": dict,
-    "onset": lambda: {"onset": mg.Onset()},
-    "slope": lambda: {"gradient": "slope"},
-    "smoothed": lambda: {"smoothing": mg.Smoothing(1e-3)},
-    "smoothed backward": lambda: {"smoothing": mg.Smoothing(1e-3, mode="backward")},
+    "onset": lambda: {"contact": mg.Onset()},
+    "slope": lambda: {"contact": mg.Slope()},
+    "smoothed": lambda: {"contact": mg.Smoothing(1e-3)},
+    "smoothed backward": lambda: {"contact": mg.Smoothing(1e-3, mode="backward")},
 }
 _COSTS = {
     "rollout": ("", "onset", "smoothed"),
@@ -224,7 +224,7 @@ def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
         cases[f"mg.rollout, {_ROOM[name]} contacts"] = nearest
         cases[f"mg value_and_grad, {_ROOM[name]} contacts"] = jax.value_and_grad(nearest)
     if is_cpu and len(jax.devices()) == 1:
-        cases['mg.rollout, engine="mujoco"'] = functools.partial(ours, engine="mujoco")
+        cases['mg.rollout, mg.Discrete("mujoco")'] = functools.partial(ours, contact=mg.Discrete("mujoco"))
     cases["mg value_and_grad"] = jax.value_and_grad(ours)
     cases["mg value_and_grad, all kept"] = jax.value_and_grad(functools.partial(ours, checkpoint=False))
     if options.forward:
@@ -426,7 +426,7 @@ def engines(
 
             def cost(speeds: jax.Array, controls: jax.Array, engine: str, scene: mg.Scene = loaded) -> jax.Array:
                 start = mg.initial_state(scene, qvel=speeds)
-                return jnp.sum(mg.rollout(scene, start, controls, gradient="slope", engine=engine).qpos[-1])  # pyright: ignore[reportArgumentType]
+                return jnp.sum(mg.rollout(scene, start, controls, contact=mg.Slope(engine)).qpos[-1])
 
             for engine in ("mujoco", "mjx"):
                 program = jax.jit(jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1))))

@@ -23,7 +23,7 @@ from experiments.video import film, shown_speed
 from experiments.words import capitalised, joined
 from experiments.workspace import Workspace
 from mjxgrad.scene import load_scene
-from mjxgrad.stepping import Smoothing
+from mjxgrad.stepping import Smoothing, own_motion
 from mjxgrad.tasks import scene_path
 
 
@@ -187,7 +187,7 @@ def _run(
     rate = optax.cosine_decay_schedule(_LEARNING_RATE, settings.num_steps, 0.05)
     decay = optax.exponential_decay(1.0, settings.num_steps, _FINAL_SCALE)
     result = mg.optimise(
-        _objective(method, task.with_gradient(method.gradient), settings),
+        _objective(method, task.with_contact(own_motion(method.gradient)), settings),
         start,
         key,
         estimator=functools.partial(getattr(mg.estimators, method.estimator), num_samples=method.num_samples),
@@ -227,7 +227,7 @@ def _objective(
         if method.margin is not None:
             smoothed = task.with_margin(own + jnp.where(scale > last, method.margin * scale, 0.0))
         if method.length is not None:
-            smoothed = task.with_smoothing(Smoothing(jnp.maximum(method.length * scale, 1e-6)))
+            smoothed = task.with_contact(Smoothing(jnp.maximum(method.length * scale, 1e-6)))
         return smoothed.objective(method.stddev).with_stddev(method.stddev * scale)
 
     return objective

@@ -24,7 +24,7 @@ from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.rollouts.integration import adaptive_rollout
 from mjxgrad.rollouts.state import data_of
-from mjxgrad.stepping import Gradient, assembly
+from mjxgrad.stepping import Contact, assembly
 from mjxgrad.tasks import scene_path
 
 
@@ -250,15 +250,15 @@ def _quotient(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, Ar
 
 
 def substepped_step(
-    model: mjx.Model, data: mjx.Data, *, num_substeps: int = 8, gradient: Gradient = "discrete"
+    model: mjx.Model, data: mjx.Data, *, num_substeps: int = 8, contact: Contact = mg.Discrete()
 ) -> mjx.Data:
     """Advance by one time step, in short steps if a contact or limit begins or ends in it: if a distance changes its sign."""
-    after = mg.step(model, data, gradient=gradient)
+    after = mg.step(model, data, contact=contact)
     short = at_time_step(model, model.opt.timestep / num_substeps)
 
     def refine(data: mjx.Data) -> mjx.Data:
         def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            return mg.step(short, data, gradient=gradient), None  # pyright: ignore[reportArgumentType]
+            return mg.step(short, data, contact=contact), None
 
         return jax.lax.scan(substep, data, length=num_substeps)[0]
 
@@ -281,10 +281,10 @@ def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Ar
 
 
 _DERIVATIVES: dict[str, Derivative] = {
-    "discrete": functools.partial(_by_steps, functools.partial(mg.step, gradient="discrete")),
-    "slope": functools.partial(_by_steps, functools.partial(mg.step, gradient="slope")),
-    "continuous": functools.partial(_by_steps, functools.partial(mg.step, onset=mg.Onset())),
-    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, gradient="slope")),
+    "discrete": functools.partial(_by_steps, functools.partial(mg.step, contact=mg.Discrete())),
+    "slope": functools.partial(_by_steps, functools.partial(mg.step, contact=mg.Slope())),
+    "continuous": functools.partial(_by_steps, functools.partial(mg.step, contact=mg.Onset())),
+    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, contact=mg.Slope())),
     "adaptive": _adaptive,
     "quotient": _quotient,
 }

@@ -25,6 +25,7 @@ from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
 from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
+from mjxgrad.stepping import own_motion
 
 Method = Literal["onset", "discrete", "slope", "alpha", "inverse_variance", "zeroth", "ppo"]
 NAMES = {
@@ -314,7 +315,7 @@ def _every(settings: Settings) -> int:
 def _stepped(environment: Environment, method: Method) -> Environment:
     """Return the environment whose derivative is the method's."""
     if method in ("discrete", "slope"):
-        return environment.with_gradient(method)
+        return environment.with_contact(own_motion(method))
     return environment
 
 

@@ -12,12 +12,13 @@ from experiments.config import ExperimentError
 from experiments.settings import OwnScene
 from mjxgrad._mjx import mjx
 from mjxgrad.checking.sweep import scene_task
+from mjxgrad.stepping import Contact
 
 Read = Callable[[Float[Array, " nq"], Float[Array, " nv"]], Float[Array, "..."]]
 
 # What derivatives are compared: MuJoCo's motion with either of its own, and a motion whose contacts begin within the step.
 DISCRETE, SLOPE, CONTINUOUS = "discrete", "slope", "continuous onset"
-ARMS = {DISCRETE: ("discrete", None), SLOPE: ("slope", None), CONTINUOUS: ("discrete", mg.Onset())}
+ARMS: dict[str, Contact] = {DISCRETE: mg.Discrete(), SLOPE: mg.Slope(), CONTINUOUS: mg.Onset()}
 
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 
@@ -47,13 +48,12 @@ def motion(
     *,
     num_times: int,
     steps_between: Int[ArrayLike, ""],
-    gradient: str,
-    onset: mg.Onset | None = None,
+    contact: Contact,
 ) -> Float[Array, "times *outcome"]:
-    """Read a motion at equal intervals, the first `steps_between` steps after the start; `gradient` and `onset` as in `ARMS`."""
+    """Read a motion at equal intervals, the first `steps_between` steps after the start; `contact` as in `ARMS`."""
 
     def step(data: mjx.Data) -> mjx.Data:
-        return mg.step(model, data, gradient=gradient, onset=onset)  # pyright: ignore[reportArgumentType]
+        return mg.step(model, data, contact=contact)
 
     def until_next(moved: mjx.Data, _: None) -> tuple[mjx.Data, Array]:
         moved = advance(step, moved, steps_between)

@@ -342,7 +342,7 @@ def _fit(settings: Settings, names: tuple[str, ...], windows: list[Recording], h
         parameters(scene, names),
         windows,
         free_start=True,
-        onset=mg.Onset() if has_onset else None,
+        contact=mg.Onset() if has_onset else mg.Discrete(),
         max_steps=settings.max_steps,
     )
     return Fit(

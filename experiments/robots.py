@@ -9,7 +9,7 @@ limit or contact is exactly at its surface, where a derivative has two values.
 - `c_*`, `mjx_*`: one step by either engine, in both precisions. The motion against `mj_step` of the file itself, and A and B, by
   reverse mode, against `mjd_transitionFD` (for RK4, which that refuses, central differences of `mj_step`). C's engine takes its
   own A and B from that function, so there the comparison is of what JAX makes of them.
-- `slope_single`: 50 steps by C's engine. The mean derivative, gradient="slope", against the slope of the motion over 33 to 513
+- `slope_single`: 50 steps by C's engine. The mean derivative, `mg.Slope`, against the slope of the motion over 33 to 513
   starts. "consistent": within two standard errors, which are wide; "ill-defined": apart, but over so few steps' phases that there
   is no slope to speak of; "flagged": off where `Trajectory.explodes` says so.
 
@@ -111,7 +111,7 @@ def _linearised(scene: mg.Scene, start: jax.Array, ctrl: jax.Array, engine: Any)
 
     def step(change: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         parts = jnp.split(system.retract(start, change), [nq, nq + nv])
-        course = mg.rollout(scene, mg.initial_state(scene, *parts), ctrl[None], engine=engine)
+        course = mg.rollout(scene, mg.initial_state(scene, *parts), ctrl[None], contact=mg.Discrete(engine))
         end = system.flatten(course.final)
         return system.difference(end, jax.lax.stop_gradient(end)), (end, course.diverged)
 
@@ -138,7 +138,7 @@ def moved_once(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     start = start_of(model, scene.data.qpos.dtype)
     after = by_differences(model, start)[0]
     state = mg.initial_state(scene, *start[:3])
-    course = eqx.filter_jit(mg.rollout)(scene, state, start[3][None], engine="mjx")
+    course = eqx.filter_jit(mg.rollout)(scene, state, start[3][None], contact=mg.Discrete("mjx"))
     ends = (course.final.qpos, course.final.qvel, course.final.act)
     return {"motion": max(map(_far, ends, after, (1.0, 1.0, 1.0))), "flagged": bool(course.diverged)}
 
@@ -153,8 +153,7 @@ def _outcomes(
     def final(place: jax.Array) -> tuple[jax.Array, jax.Array]:
         controls = jnp.broadcast_to(ctrl + place * line[1], (_HORIZON, ctrl.size))
         state = mg.initial_state(scene, qpos, qvel + place * line[0], act)
-        how = {"engine": "mujoco", "gradient": "slope", "measure_growth": measure_growth}
-        course = mg.rollout(scene, state, controls, **how)
+        course = mg.rollout(scene, state, controls, contact=mg.Slope("mujoco"), measure_growth=measure_growth)
         moved = position_change(scene.model, qpos, course.final.qpos)
         return jnp.where(course.diverged, jnp.nan, weights @ moved), course.explodes
 

@@ -210,7 +210,7 @@ def _seen(task: RollingPin, variant: Variant, scale: Array, mode: str | None, se
     # Without a margin this is the contact of the scene.
     rest = settings.remedies.rest_acceleration
     task = task.with_softness(mg.Softness(STIFFNESS, 1.0, margin=scale * variant["margin"], rest_acceleration=rest))
-    return task.with_smoothing(None if mode is None else Smoothing(scale * variant["length"], settings.kernel, mode))
+    return task if mode is None else task.with_contact(Smoothing(scale * variant["length"], settings.kernel, mode))
 
 
 def answer(outcome: Outcome) -> str:

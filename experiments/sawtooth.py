@@ -30,7 +30,7 @@ from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.native.derivative import to_coordinates
 from mjxgrad.native.engine import Engine
-from mjxgrad.stepping import Gradient
+from mjxgrad.stepping import Gradient, own_motion
 from mjxgrad.tasks import scene_path
 
 RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant"]
@@ -264,8 +264,7 @@ def _sample(
     model: mjx.Model, start: mjx.Data, parameters: Array, steps_between: Array, read: Read, moved: int, arm: str
 ) -> tuple[Array, Array]:
     """Give readings and derivatives; time steps differ in arrays alone, so one compilation serves them all."""
-    gradient, onset = ARMS[arm]
-    how = {"num_times": _NUM_TIMES, "steps_between": steps_between, "gradient": gradient, "onset": onset}
+    how = {"num_times": _NUM_TIMES, "steps_between": steps_between, "contact": ARMS[arm]}
 
     def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
         return motion(model, start.replace(qpos=start.qpos.at[moved].add(parameter)), read, **how)
@@ -356,9 +355,8 @@ def _own_course(settings: Settings, workspace: Workspace) -> xr.Dataset:
     workspace.check(task.scene)
     parameters, arms = phases((-settings.width, settings.width), settings.num_phases), {}
     for arm in _ARMS:
-        gradient, onset = ARMS.get(arm, ("slope", None))
-        stepped = task.with_gradient(gradient) if onset is None else task.with_onset(onset)
-        knob = Knob(stepped.with_engine("mujoco") if arm in _BY_MUJOCO else stepped, 1.0, settings.seed)
+        contact = own_motion(_BY_MUJOCO[arm], "mujoco") if arm in _BY_MUJOCO else ARMS[arm]
+        knob = Knob(task.with_contact(contact), 1.0, settings.seed)
         objective = knob(mg.Softness(stiffness=knob.own or 1.0)).sized_for(jnp.zeros(1))
 
         def cost(at: Array, objective: mg.Objective = objective) -> Array:

@@ -14,7 +14,6 @@ from mjxgrad.objective import (
     SceneTask,
     closed_loop,
     linear_policy,
-    mlp_policy,
     open_loop,
     parameter_noise,
 )
@@ -31,9 +30,10 @@ from mjxgrad.rollouts import (
     rollout,
 )
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
-from mjxgrad.stepping import Onset, Smoothing, contact_force, forward, solve, step
+from mjxgrad.stepping import Discrete, Onset, Slope, Smoothing, contact_force, forward, solve, step
 
 __all__ = [
+    "Discrete",
     "DivergedError",
     "History",
     "Linearisation",
@@ -42,6 +42,7 @@ __all__ = [
     "Optimisation",
     "Scene",
     "SceneTask",
+    "Slope",
     "Smoothing",
     "Softness",
     "State",
@@ -68,7 +69,6 @@ __all__ = [
     "linear_policy",
     "linearise",
     "load_scene",
-    "mlp_policy",
     "open_loop",
     "optimise",
     "over_devices",

@@ -17,6 +17,11 @@ import jax
 _Function = TypeVar("_Function", bound=Callable)
 
 
+def is_traced(arguments: Any) -> bool:
+    """Return whether a tree has traced values, as inside `jax.jit` and `jax.grad`."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
+
+
 def compiled(function: _Function) -> _Function:
     """Compile a function of arrays, or trees with arrays, once per shape and structure.
 
@@ -27,7 +32,7 @@ def compiled(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+        if is_traced((args, kwargs)):
             return function(*args, **kwargs)
         # Weak types belong to a program's signature: feeding results back would compile it a second time.
         strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731

@@ -186,8 +186,7 @@ def sweep(
         log=lambda text: _say(f"{time.monotonic() - started:4.0f} s  {text}"),
         start=start,
         horizon=horizon,
-        gradient=gradient,
-        engine=engine,
+        contact=mg.stepping.own_motion(gradient, engine),
     )
     print(found)
     html.write_text(found.as_html(), encoding="utf-8")

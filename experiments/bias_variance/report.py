@@ -339,7 +339,9 @@ def video(outcome: Outcome, workspace: Workspace, wanted: ThrowsSettings) -> tup
     @jax.jit
     def throw(softness, angles):
         thrown = task.with_softness(softness)
-        return jax.vmap(lambda angle: thrown.trajectory(angle[None]).qpos)(angles)
+        return jax.vmap(lambda angle: mg.rollout(thrown.scene, thrown.start(angle[None]), horizon=thrown.horizon).qpos)(
+            angles
+        )
 
     motions = [
         (mj_model, qpos)

@@ -259,7 +259,7 @@ class Problem:
 
     def objective(self, gradient: str, stddev: float) -> mg.Objective:
         """Give the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""
-        return self.task.with_onset(mg.Onset() if gradient == ONSET else None).objective(jnp.asarray(stddev))
+        return self.task.with_contact(mg.Onset() if gradient == ONSET else mg.Slope()).objective(jnp.asarray(stddev))
 
 
 def problem(name: str, settings: Settings) -> Problem:

@@ -49,9 +49,7 @@ class Billiards(InScene):
 
     def trajectory(self, params: Float[Array, " dim"]) -> Trajectory:
         start = initial_state(self.scene)
-        return rollout(
-            self.scene, start, self.controls(params), gradient=self.gradient, onset=self.onset, smoothing=self.smoothing
-        )
+        return rollout(self.scene, start, self.controls(params), contact=self.contact)
 
     def cost(self, params: Float[Array, " dim"]) -> Float[Array, ""]:
         """Return the squared distance to the target plus the price of the effort, in m²; NaN if the rollout diverged."""

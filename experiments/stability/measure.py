@@ -427,8 +427,7 @@ class Program:
             mg.initial_state(scene, qpos, qvel),
             horizon=self._settings.num_steps,
             observe=observe,
-            gradient="discrete",
-            onset=mg.Onset() if self._settings.onset else None,
+            contact=mg.Onset() if self._settings.onset else mg.Discrete(),
         )
         return trajectory.qpos[-1] @ self._weights, trajectory
 

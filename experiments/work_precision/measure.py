@@ -316,12 +316,12 @@ def repeated(
 def _simulate(
     variant: Variant, start: mjx.Data, model: mjx.Model, qvel: Float[Array, " nv"], num_steps: Array
 ) -> tuple[Array, Array]:
-    onset = mg.Onset() if variant.library == ONSET else None
+    contact = mg.Onset() if variant.library == ONSET else mg.Discrete()
 
     def step(data: mjx.Data) -> mjx.Data:
         if variant.library == MJX:
             return mjx.step(model, data)
-        return mg.step(model, data, gradient="discrete", onset=onset)
+        return mg.step(model, data, contact=contact)
 
     final = advance(step, start.replace(qvel=qvel), num_steps)
     return final.qpos, final.qvel

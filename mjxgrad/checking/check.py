@@ -20,6 +20,7 @@ from mjxgrad._text import format_number
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import (
     MANY_PAIRS,
+    WORDS,
     Finding,
     Recommendation,
     headline,
@@ -36,9 +37,10 @@ from mjxgrad.checking.moving import Mover, Outcomes
 from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page
-from mjxgrad.rollouts import Engine, Trajectory
+from mjxgrad.rollouts import Trajectory
 from mjxgrad.scene import Scene, SceneError, load_scene
 from mjxgrad.scene.load import count_pairs
+from mjxgrad.stepping import Engine
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -317,7 +319,6 @@ def _code(scene: Scene, advice: Recommendation, path: str) -> str:
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:
         settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"
-    step = f'gradient="{advice.gradient}"'
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
     noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
     key = first_keyframe(scene.mj_model)
@@ -335,7 +336,7 @@ import mjxgrad as mg
 
 scene = mg.load_scene({path!r}{settings})
 cost = lambda trajectory: trajectory.qpos[-1, 0]  # yours
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {step})
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {WORDS[advice.gradient]})
 objective = {objective}
 estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
 """

@@ -27,7 +27,8 @@ _CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
 _FEWEST_TEETH = 4
 _DISAGREES = 0.1  # relative difference beyond which the slopes at two time steps disagree
 
-_WORDS = {"slope": 'gradient="slope"', "discrete": 'gradient="discrete"'}
+WORDS = {"slope": "contact=mg.Slope()", "discrete": "contact=mg.Discrete()"}
+"""Arguments of `mg.rollout` and tasks, by kind of derivative."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
     if not found[-1].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     read = [one for one in found if one.num_readings]
-    parts = [f"{_WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
+    parts = [f"{WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
     lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
     return Finding("slope", f"{lead} {' '.join(parts)}")
 
@@ -294,9 +295,7 @@ def _time_step(spring: Spring, speed: float | None) -> str:
 
 def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
     """Return the answer in at most 15 words."""
-    answer = (
-        f'gradient="{advice.gradient}"' + f" and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
-    )
+    answer = f"{WORDS[advice.gradient]} and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
     minded = [finding.kind for finding in findings if finding.is_fault or finding.kind == "not_measured"]
     words = {
         "time_step": "the time step is too long",

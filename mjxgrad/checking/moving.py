@@ -25,6 +25,7 @@ from mjxgrad.native.engine import engine_of
 from mjxgrad.objective.task import finite_cost
 from mjxgrad.rollouts import State, Trajectory, rollout
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import own_motion
 
 Kind = Literal["slope", "discrete", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")
@@ -170,8 +171,7 @@ class Mover:
                     with_contact(scene, contact),
                     state,
                     ctrl,
-                    gradient=kind,  # pyright: ignore[reportArgumentType]
-                    engine="mjx",
+                    contact=own_motion(kind, "mjx"),
                     checkpoint=False,
                 )
                 return course.qpos[1:], course.qvel[1:], jnp.asarray(course.act)[1:]

@@ -31,9 +31,9 @@ from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.objective.task import SceneTask
 from mjxgrad.report import Block, Table, page, svg
-from mjxgrad.rollouts import Engine, Trajectory, initial_state
+from mjxgrad.rollouts import Trajectory, initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
-from mjxgrad.stepping import Gradient
+from mjxgrad.stepping import Contact, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # costs, and the number of bodies or sites of each
@@ -47,8 +47,7 @@ def scene_task(
     *,
     start: str | None = None,
     horizon: int | None = None,
-    gradient: Gradient = "slope",
-    engine: Engine | None = None,
+    contact: Contact = Slope(),
     seed: int = 0,
 ) -> SceneTask:
     """Return a task of a scene, with cost and start given by names.
@@ -60,8 +59,7 @@ def scene_task(
             its tilt), reach:hand/ball (their distance, m). None is a random mix of the heaviest body's final coordinates.
         start: a key frame; None is the reference pose, at rest.
         horizon: number of steps; None is half a second, but 50 to 300 steps.
-        gradient: gradient of MuJoCo's motion, see `rollout`.
-        engine: see `rollout`.
+        contact: how contact is stepped, see `rollout`.
         seed: seed of the mix.
 
     Raises:
@@ -78,7 +76,7 @@ def scene_task(
     cost = _named_cost(scene, cost) if isinstance(cost, str) else cost
     usual = int(np.clip(round(_SECONDS / model.opt.timestep), _FEWEST_STEPS, _MOST_STEPS))
     horizon = usual if horizon is None else horizon
-    return SceneTask(scene, state, cost, horizon, gradient=gradient, engine=engine)  # pyright: ignore[reportCallIssue]
+    return SceneTask(scene, state, cost, horizon, contact=contact)  # pyright: ignore[reportCallIssue]
 
 
 def load_function(name: str) -> Callable[..., Any]:
@@ -277,7 +275,7 @@ def sweep(
         num_reference: rollouts for the truth.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts.
-        **task_settings: start, horizon, gradient and engine of `scene_task`.
+        **task_settings: start, horizon and contact of `scene_task`.
 
     Raises:
         ValueError: as `scene_task` and `bias_variance`, or if a stiffness is not positive.

@@ -131,7 +131,7 @@ def derivative_against_slope(
 
     Args:
         simulate: function from a parameter and the name of a gradient to the outcome, of any shape. For instance positions at
-            several times of `mg.rollout(..., gradient=gradient)` from a start that depends on the parameter. Its value must
+            several times of `mg.rollout(..., contact=contacts[name])` from a start that depends on the parameter. Its value must
             not depend on the name. It is compiled once per name and function object; a pytree (`jax.tree_util.Partial`,
             `eqx.Module`) is reused where only its arrays differ.
         interval: first and last parameter. Long enough that the first contact moves through ten time steps or more, and short

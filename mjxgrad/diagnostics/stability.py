@@ -284,7 +284,7 @@ class StabilityReport:
         unit = " m" if spring.kind == "contact" else ""
         return (
             f"at {at} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-            'gradient="slope", as tasks do by default, or an impedance from 0 over a width of at least '
+            "contact=mg.Slope(), as tasks do by default, or an impedance from 0 over a width of at least "
             f"{STEPS_NEEDED * speed * self.timestep:.2g}{unit}"
         )
 

@@ -19,7 +19,7 @@ from mjxgrad._arrays import whole
 from mjxgrad.objective.task import InScene, optional_pytree
 from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Gradient
+from mjxgrad.stepping import Contact, Discrete
 
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """A function from a key and a scene to a scene with other friction, masses or gains, by `scene.with_model`."""
@@ -61,8 +61,8 @@ class Environment(InScene):
 
     An action has one number per actuator, clipped to −1 and 1, the ends of its `ctrlrange`. It holds for `frame_skip` time
     steps. The motion is MuJoCo's own, in which policies are judged, with the derivative of its steps; ants and hoppers learn
-    most with it. `with_gradient("slope")` takes the derivative of the outcome, `with_onset(mg.Onset())` a continuous motion,
-    `with_engine("mujoco")` C MuJoCo.
+    most with it. `with_contact(mg.Slope())` takes the derivative of the outcome, `with_contact(mg.Onset())` a continuous
+    motion, `with_contact(mg.Discrete("mujoco"))` C MuJoCo.
 
     Attributes:
         frame_skip: time steps per action.
@@ -70,7 +70,7 @@ class Environment(InScene):
         randomisation: function from a key and the scene to the scene of one copy; see `randomised`.
     """
 
-    gradient: Gradient = eqx.field(static=True, default="discrete", kw_only=True)
+    contact: Contact = eqx.field(default=Discrete(), kw_only=True)
     frame_skip: int = eqx.field(static=True, default=1, kw_only=True)
     episode_length: int = eqx.field(static=True, default=1000, kw_only=True)
     randomisation: Randomisation | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
@@ -188,10 +188,7 @@ class Environment(InScene):
             self.scene,
             physics,
             jnp.broadcast_to(ctrl, (self.frame_skip, self.num_actions)),
-            gradient=self.gradient,
-            onset=self.onset,
-            smoothing=self.smoothing,
-            engine=self.engine,
+            contact=self.contact,
         )
 
     def step_on(self, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import mujoco.mjx
 
 from mjxgrad._mjx import mjx
-from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient, step
+from mjxgrad.stepping import Contact, Discrete, check_contact, step
 
 Foreign = TypeVar("Foreign")
 _LOCK = threading.RLock()
@@ -23,28 +23,24 @@ def load(
     config: Any = None,
     config_overrides: Mapping[str, Any] | None = None,
     *,
-    gradient: Gradient = "discrete",
-    onset: Onset | None = None,
-    smoothing: Smoothing | None = None,
+    contact: Contact = Discrete(),
     iterations: int = 100,
 ) -> Any:
     """Load an environment of MuJoCo Playground, to be stepped by `mg.step`.
 
     The object is Playground's own and works with its wrappers and randomisers. Its motion is Playground's with a converged
-    solver, unless an onset or smoothing changes it.
+    solver, unless `contact` changes it.
 
     Args:
         name: name for `registry.load`, for instance "CartpoleSwingup".
         config: Playground's configuration; None is the default.
         config_overrides: values by flattened name; `impl` is always "jax", the implementation that has derivatives.
-        gradient: see `mg.step`.
-        onset: contacts begin within the step; `mg.Onset()` for learning by derivatives.
-        smoothing: average over contacts; see `mg.step`.
+        contact: how contact is stepped, see `mg.step`.
         iterations: see `stepped_right`.
 
     Raises:
         ImportError: if playground is not installed.
-        ValueError: if there is no such environment or gradient, or it does not go with onset or smoothing.
+        ValueError: if there is no such environment, or contact does not suit `mg.step`.
     """
     # Imported here: brax's environments need no playground.
     try:
@@ -55,15 +51,13 @@ def load(
     # A copy, because the overrides change the configuration in place.
     own = None if config is None else config.copy_and_resolve_references()
     environment = registry.load(name, own, overrides)
-    return stepped_right(environment, gradient=gradient, onset=onset, smoothing=smoothing, iterations=iterations)
+    return stepped_right(environment, contact=contact, iterations=iterations)
 
 
 def stepped_right(
     environment: Foreign,
     *,
-    gradient: Gradient = "discrete",
-    onset: Onset | None = None,
-    smoothing: Smoothing | None = None,
+    contact: Contact = Discrete(),
     iterations: int = 100,
 ) -> Foreign:
     """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`.
@@ -71,9 +65,7 @@ def stepped_right(
     Args:
         environment: an object with these methods on MJX's JAX implementation: from Playground, from brax's backend "mjx", or
             your own. Only this object changes.
-        gradient: see `mg.step`.
-        onset: contacts begin within the step; `mg.Onset()` for learning by derivatives.
-        smoothing: average over contacts; see `mg.step`.
+        contact: how contact is stepped, see `mg.step`.
         iterations: least limit on the solver's iterations; it stops at the model's tolerance. Many of their models stop after
             1 to 4, far from the tolerance where feet hit the ground. The motion is then not the model's, and the solve's
             derivative is not the motion's.
@@ -82,10 +74,10 @@ def stepped_right(
         The same object.
 
     Raises:
-        ValueError: if there is no such gradient, or it does not go with onset or smoothing.
+        ValueError: if contact does not suit `mg.step`.
     """
-    check_gradient(gradient, onset, smoothing)
-    own_step = functools.partial(_step, iterations, gradient=gradient, onset=onset, smoothing=smoothing)
+    check_contact(contact, is_step=True)
+    own_step = functools.partial(_step, iterations, contact=contact)
     # On the object, not in a wrapper: randomisers of models call the step of the innermost environment.
     for name in ("reset", "step"):
         setattr(environment, name, _within(getattr(environment, name), own_step))

@@ -14,7 +14,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene, sensor
-from mjxgrad.stepping import Gradient, Onset
+from mjxgrad.stepping import Contact
 
 _STATES = ("qpos", "qvel", "act")
 
@@ -240,8 +240,7 @@ def residuals(
     offset: Float[Array, " both"] | None,
     delay: Float[Array, ""] | None,
     *,
-    onset: Onset | None,
-    gradient: Gradient,
+    contact: Contact,
 ) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
     """Return the simulated less the measured signals of one window, in units of the noise, and whether the motion diverged.
 
@@ -250,8 +249,7 @@ def residuals(
         window: one window, without the leading axis.
         offset: change of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
         delay: delay of the controls beyond the recorded times (s); None for none.
-        onset: as in `rollout`.
-        gradient: as in `rollout`.
+        contact: as in `rollout`.
     """
     model, state, controls = scene.model, window.state, window.controls
     if offset is not None:
@@ -265,9 +263,8 @@ def residuals(
     def observe(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
         return {name: sensor(model, data, name) for name in sensors}
 
-    course = rollout(
-        scene, state, controls, checkpoint=False, onset=onset, gradient=gradient, observe=observe if sensors else None
-    )
+    look = observe if sensors else None
+    course = rollout(scene, state, controls, checkpoint=False, contact=contact, observe=look)
     found = {name: getattr(course, name) for name in _STATES} | (course.observations or {})
     parts = []
     for name, measured in window.measured.items():

@@ -153,7 +153,7 @@ class Identification:
         if self.stopped is Stopped.STALLED:
             found.append(
                 f"Stalled: the linear model would remove {100 * self.removable:.2g} % of the sum of squares, but no step helps. "
-                "Jumps in the motion cause this: take onset=mg.Onset(), shorter windows or another start; doubt the intervals."
+                "Jumps in the motion cause this: take contact=mg.Onset(), shorter windows or another start; doubt the intervals."
             )
         if self.has_noise and exceeds_noise(self.rms[1], self.num_numbers - len(self.names)):
             found.append(

@@ -26,7 +26,7 @@ from mjxgrad.identification.recording import Recording, Windows, residuals, stac
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Gradient, Onset
+from mjxgrad.stepping import Contact, Discrete
 
 Apply = Callable[[Scene, Values], Scene]
 Log = Callable[[int, dict[str, float]], None]
@@ -69,8 +69,7 @@ def identify(
     apply: Apply | None = None,
     delay: str | None = None,
     free_start: bool = False,
-    onset: Onset | None = None,
-    gradient: Gradient = "discrete",
+    contact: Contact = Discrete(),
     max_steps: int = 100,
     num_points: int = 256,
     log: Log | None = None,
@@ -91,9 +90,8 @@ def identify(
             them.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
-        onset: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need: the intervals do not cover the
-            error of another motion. `mg.Onset()` is a smoother motion, for recordings of real things.
-        gradient: as in `rollout`.
+        contact: as in `rollout`. The default is MuJoCo's motion, which recordings by MuJoCo need: the intervals do not cover
+            the error of another motion. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of simulations with derivatives.
         num_points: number of points of a global search between the bounds. It runs where the descent leaves more than the
             stated noise, as where contacts chatter; a second descent begins at the best point. 0 for no such search; there is
@@ -125,7 +123,7 @@ def identify(
         return changed if apply is None else apply(changed, values)
 
     experiments = [Experiment(*parts, put) for parts in zip(scenes, groups, others, strict=True)]
-    settings = {"delay": delay, "free_start": free_start, "onset": onset, "gradient": gradient}
+    settings = {"delay": delay, "free_start": free_start, "contact": contact}
     units = {name: parameter.unit for name, parameter in parameters.items()}
     return search(experiments, coordinates, units, max_steps=max_steps, num_points=num_points, log=log, **settings)
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad._programs import compile_once
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.rollouts import Engine
+from mjxgrad.stepping import Discrete, Engine
 
 
 class Evaluation(eqx.Module):
@@ -53,7 +53,7 @@ def evaluate(
     """
     if num_episodes < 1:
         raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
-    judge = environment if engine == "mjx" else environment.with_engine(engine)
+    judge = environment if engine == "mjx" else environment.with_contact(Discrete(engine))
 
     def one(key: PRNGKeyArray) -> Evaluation:
         start = judge.reset(key)

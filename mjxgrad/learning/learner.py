@@ -14,11 +14,10 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.learning.networks import Network, Normaliser
+from mjxgrad.learning.networks import FINAL_SCALE, Network, Normaliser
 from mjxgrad.learning.settings import Settings
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, window_gradients
 from mjxgrad.loop.run import Method
-from mjxgrad.objective.policy import FINAL_SCALE
 
 Metrics = dict[str, Float[Array, ""]]
 _TRACE = 0.95  # λ of the value function's targets

@@ -7,6 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+# The last layer starts a hundred times smaller than the others, so that the first actions are near zero and depend little on
+# the state. Among initialisations this choice mattered most (Andrychowicz et al., arXiv:2006.05990, section 3.2).
+FINAL_SCALE = 0.01
+
 
 class Network(eqx.Module):
     """A multilayer perceptron whose hidden layers end in an exponential linear unit and layer normalisation.

@@ -15,9 +15,10 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import Engine, Gradient, engine_of
+from mjxgrad.native.engine import Engine, engine_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
+from mjxgrad.stepping import Gradient
 
 _Arrays = Mapping[str, Array]
 
@@ -98,7 +99,7 @@ def _jacobians(
 
     @call.defjvp
     def _refuse(primals, tangents):
-        raise ValueError('engine="mujoco" has first derivatives alone: take engine="mjx" for second ones')
+        raise ValueError('C MuJoCo has first derivatives alone: for second ones take engine "mjx"')
 
     return call(numbers, before, inputs)
 

@@ -8,7 +8,6 @@ import os
 import threading
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal
 
 import mujoco
 import mujoco.rollout
@@ -17,8 +16,8 @@ from jaxtyping import Float
 
 from mjxgrad.native.events import Events, Near, Surfaces, levers_of
 from mjxgrad.scene.scene import with_numbers
+from mjxgrad.stepping import Gradient
 
-Gradient = Literal["discrete", "slope"]
 INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat")
 """What may be given to each step, in the order in which MuJoCo keeps it."""
 START = ("time", "qpos", "qvel", "act")

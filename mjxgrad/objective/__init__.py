@@ -3,7 +3,7 @@
 from mjxgrad.objective.actions import ActionNoise, ClosedLoop, OpenLoop, closed_loop, open_loop
 from mjxgrad.objective.base import Differentiated, Objective
 from mjxgrad.objective.parameters import ParameterNoise, as_vector, flattened, of_vector, parameter_noise
-from mjxgrad.objective.policy import linear_policy, mlp_policy
+from mjxgrad.objective.policy import linear_policy
 from mjxgrad.objective.task import Outcome, SceneTask, Task
 
 __all__ = [
@@ -20,7 +20,6 @@ __all__ = [
     "closed_loop",
     "flattened",
     "linear_policy",
-    "mlp_policy",
     "of_vector",
     "open_loop",
     "parameter_noise",

@@ -55,18 +55,18 @@ class ActionNoise(Objective):
         return gaussian(action_key, self.stddev, self.noise_shape), self.task.sample_start(start_key)
 
     def mirror(self, noise: PyTree) -> PyTree:
-        # The start stays: both rollouts of a pair begin at the same place.
-        actions, start = self.split(noise)
-        return -actions if start is None else (-actions, start)
+        return self._with_actions(noise, jnp.negative)
 
     def redraw(self, noise: PyTree, key: PRNGKeyArray) -> PyTree:
-        _, start = self.split(noise)
-        actions = gaussian(key, self.stddev, self.noise_shape)
-        return actions if start is None else (actions, start)
+        return self._with_actions(noise, lambda _: gaussian(key, self.stddev, self.noise_shape))
 
     def silence(self, noise: PyTree) -> PyTree:
+        return self._with_actions(noise, jnp.zeros_like)
+
+    def _with_actions(self, noise: PyTree, change: Callable[[Array], Array]) -> PyTree:
+        # The start stays: both rollouts of a pair begin at the same place.
         actions, start = self.split(noise)
-        return jnp.zeros_like(actions) if start is None else (jnp.zeros_like(actions), start)
+        return change(actions) if start is None else (change(actions), start)
 
     @property
     def has_circumstances(self) -> bool:

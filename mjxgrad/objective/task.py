@@ -12,9 +12,9 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import form
 from mjxgrad.contact import Softness
-from mjxgrad.rollouts import Engine, Observe, Policy, Sees, State, Trajectory, rollout
+from mjxgrad.rollouts import Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Gradient, Onset, Smoothing, check_gradient
+from mjxgrad.stepping import Contact, Slope, check_contact
 
 
 class Outcome(eqx.Module):
@@ -92,35 +92,17 @@ class InScene(eqx.Module):
 
     Attributes:
         scene: the scene, from `load_scene`.
-        gradient: derivative of each step, "slope" or "discrete", see `rollout`. "slope" is the slope of the outcome, except
-            for jumps between hit and miss.
-        onset: onset of contacts within the step, a continuous motion; None for MuJoCo's own motion. A leaf.
-        smoothing: average over contacts in each step, see `step`; a leaf, so that a sweep over its length is one `jax.vmap`.
-        engine: "mjx" or "mujoco", see `rollout`; None is the scene's own.
+        contact: how contact is stepped, see `rollout`; by default with the derivative that descents need, the slope of the
+            outcome. A sweep over its lengths is one `jax.vmap`.
     """
 
     scene: Scene
-    gradient: Gradient = eqx.field(static=True, default="slope", kw_only=True)
-    onset: Onset | None = eqx.field(default=None, kw_only=True)
-    smoothing: Smoothing | None = eqx.field(default=None, kw_only=True)
-    engine: Engine | None = eqx.field(static=True, default=None, kw_only=True)
+    contact: Contact = eqx.field(default=Slope(), kw_only=True)
 
-    def with_gradient(self: Same, gradient: Gradient) -> Same:
-        """Return a copy with MuJoCo's own motion and one of its derivatives."""
-        check_gradient(gradient)
-        return dataclasses.replace(self, gradient=gradient, onset=None)
-
-    def with_onset(self: Same, onset: Onset | None) -> Same:
-        """Return a copy with contacts that begin within the step; None is MuJoCo's motion and the slope."""
-        return dataclasses.replace(self, gradient="slope" if onset is None else "discrete", onset=onset)
-
-    def with_engine(self: Same, engine: Engine) -> Same:
-        """Return a copy with MuJoCo's own motion, by MJX or by C MuJoCo."""
-        return dataclasses.replace(self, onset=None, engine=engine)
-
-    def with_smoothing(self: Same, smoothing: Smoothing | None) -> Same:
-        """Return a copy with contact averaged over noise."""
-        return dataclasses.replace(self, smoothing=smoothing)
+    def with_contact(self: Same, contact: Contact) -> Same:
+        """Return a copy whose contacts are stepped otherwise."""
+        check_contact(contact)
+        return dataclasses.replace(self, contact=contact)
 
     def with_softness(self: Same, softness: Softness) -> Same:
         """Return a copy with other contact softness."""
@@ -180,10 +162,7 @@ class SceneTask(Task, InScene):
             horizon=self.horizon,
             observe=self.observe,
             policy_sees=self.policy_sees,
-            gradient=self.gradient,
-            onset=self.onset,
-            smoothing=self.smoothing,
-            engine=self.engine,
+            contact=self.contact,
         )
         states = trajectory.seen
         if states is None:

@@ -9,7 +9,7 @@ Across a contact the mean is smooth even where f is not: A and B contain the eff
 
 There are three ways to this model:
 
-- `Sampled` in first order averages Jacobians. It misses their blind spots: jumps of f, and with `gradient="discrete"` the
+- `Sampled` in first order averages Jacobians. It misses their blind spots: jumps of f, and with `mg.Discrete()` the
   shift of the time of an impact.
 - `Sampled` in zeroth order fits a plane to samples of f. It misses nothing, at the price of noise.
 - `Analytic` differentiates a step whose solver averages the contact force. The noise is on the distance of contacts, not on
@@ -97,16 +97,19 @@ class Analytic(Smoother):
     smoothing: Smoothing | None
 
     def step(self, system, state, control, key):
-        return system.with_smoothing(self.smoothing).step(state, control)
+        return self._smoothed(system).step(state, control)
 
     def linear_model(self, system, state, control, key, *, wrt_state=True):
-        system = system.with_smoothing(self.smoothing)
+        system = self._smoothed(system)
         noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
         jacobian, ends = _linearised(system, state, control, noise, wrt_state)
         change, jacobian = _changes(system, ends, ends[0], jacobian)
         is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
         exact, none = jnp.zeros_like(jacobian[0]), jnp.zeros_like(change[0])
         return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1)
+
+    def _smoothed(self, system: System) -> System:
+        return system if self.smoothing is None else system.with_contact(self.smoothing)
 
     def scaled(self, factor: ArrayLike) -> "Analytic":
         # Lengths are its only leaves.

@@ -4,9 +4,9 @@ A state is one flat vector. A change of it has the coordinates of the tangent sp
 Code that linearises, samples or plans moves states by `retract` and compares them by `difference`, for any coordinates.
 """
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Smoothing, step
+from mjxgrad.stepping import Contact, Discrete, check_contact, step
 
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]
@@ -72,14 +72,12 @@ class System(eqx.Module):
         )
         return low, high
 
-    def with_smoothing(self, smoothing: Smoothing | None) -> "System":
-        """Return the system with another analytic smoothing of its contacts.
+    def with_contact(self, contact: Contact) -> "System":
+        """Return the system with its contacts stepped otherwise, such as smoothed.
 
         Raises:
-            ValueError: if the system has no contacts to smooth.
+            ValueError: if the system has no contacts.
         """
-        if smoothing is None:
-            return self
         raise ValueError(
             f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: take samples, by Sampled"
         )
@@ -114,14 +112,12 @@ class SceneSystem(System):
     Attributes:
         scene: the scene, from `load_scene`.
         num_substeps: time steps per step of the system.
-        gradient: derivative of contact and limit events, "discrete" or "slope"; see `mjxgrad.step`.
-        smoothing: smoothing of contacts and limits in the solver, or None; see `mjxgrad.step`.
+        contact: how contact is stepped, see `mjxgrad.step`.
     """
 
     scene: Scene
     num_substeps: int = eqx.field(static=True, default=1)
-    gradient: Literal["discrete", "slope"] = eqx.field(static=True, default="discrete")
-    smoothing: Smoothing | None = None
+    contact: Contact = Discrete()
 
     def __check_init__(self):
         if self.num_substeps < 1:
@@ -167,7 +163,7 @@ class SceneSystem(System):
 
         def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
             # Only these fields are carried: the rest of Data would be copied in every iteration.
-            moved = step(self.scene.model, data, gradient=self.gradient, smoothing=self.smoothing)
+            moved = step(self.scene.model, data, contact=self.contact)
             names = ("qpos", "qvel", "act", "qacc_warmstart")
             return data.replace(**{name: getattr(moved, name) for name in names}), None
 
@@ -184,9 +180,9 @@ class SceneSystem(System):
         moved = position_change(self.scene.model, start[:nq], end[:nq])
         return jnp.concatenate([moved, end[nq:] - start[nq:]])
 
-    def with_smoothing(self, smoothing: Smoothing | None) -> "SceneSystem":
-        """Return the system with another smoothing; None removes it."""
-        return eqx.tree_at(lambda system: system.smoothing, self, smoothing, is_leaf=lambda x: x is None)
+    def with_contact(self, contact: Contact) -> "SceneSystem":
+        check_contact(contact, is_step=True)
+        return dataclasses.replace(self, contact=contact)
 
 
 class Cost(eqx.Module):

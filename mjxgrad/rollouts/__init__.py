@@ -1,6 +1,6 @@
 """Rollouts of a scene by MJX or C MuJoCo, with states, trajectories, linear models, adaptive integration and rendering."""
 
-from mjxgrad.rollouts.arguments import Engine, Observe, Policy, Sees
+from mjxgrad.rollouts.arguments import Observe, Policy, Sees
 from mjxgrad.rollouts.linearisation import Linearisation, linearise
 from mjxgrad.rollouts.rollout import rollout
 from mjxgrad.rollouts.state import State, initial_state
@@ -8,7 +8,6 @@ from mjxgrad.rollouts.trajectory import DivergedError, Trajectory, check_traject
 
 __all__ = [
     "DivergedError",
-    "Engine",
     "Linearisation",
     "Observe",
     "Policy",

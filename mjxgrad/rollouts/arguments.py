@@ -13,13 +13,13 @@ from mjxgrad._mjx import mjx
 from mjxgrad.native import INPUTS
 from mjxgrad.rollouts.state import State
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import Contact, OwnMotion, check_contact
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 """Function from policy parameters and the state or observations to controls."""
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 """Function from model and data to a pytree of arrays."""
 Sees = Literal["state", "observations"]
-Engine = Literal["mjx", "mujoco"]
 
 
 def check_policy_sees(policy_sees: str, observe: Observe | None) -> None:
@@ -63,12 +63,12 @@ def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) 
     return found
 
 
-def check_engine(engine: str, **given: Any) -> None:
-    """Refuse an unknown engine, and settings that C MuJoCo does not have."""
-    if engine != "mujoco":
-        raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
-    if named := [name for name, value in given.items() if value is not None]:
-        raise ValueError(f'engine="mujoco" is MuJoCo\'s own motion, got {" and ".join(named)}: leave it out')
+def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
+    """Check how contact is stepped, and return it where C MuJoCo steps it, None where MJX does."""
+    check_contact(contact)
+    if isinstance(contact, OwnMotion) and (contact.engine or scene.engine) == "mujoco":
+        return contact
+    return None
 
 
 def one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:

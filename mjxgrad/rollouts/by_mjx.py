@@ -1,12 +1,12 @@
 """A rollout by MJX: one checkpointed scan with a small carry, and failure flags."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
@@ -17,7 +17,7 @@ from mjxgrad.rollouts.state import State, data_of, direction, is_sound, state_of
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
-from mjxgrad.stepping import Gradient, Onset, Smoothing, forward, step
+from mjxgrad.stepping import Contact, Onset, Smoothing, forward, step
 from mjxgrad.stepping.onset import reach
 
 
@@ -26,10 +26,7 @@ class Settings(NamedTuple):
 
     policy_sees: Sees
     checkpoint: bool
-    gradient: Gradient
-    onset: Onset | None
-    smoothing: Smoothing | None
-    velocity_limit: float | None
+    contact: Contact
     measure_growth: bool
 
 
@@ -83,36 +80,34 @@ class _Scan:
         state, model, settings = carry.state, self.scene.model, self.settings
         index, row, disturbance, forces = given
         seen = None if carry.before is None else self.look(state, carry.before, forces)
-        ctrl = (row if self.policy is None else self.choose(state if carry.before is None else seen)) + disturbance
+        if self.policy is not None:
+            row = one_each(self.policy(self.params, state if carry.before is None else seen), model.nu)
+        ctrl = row + disturbance
         data = data_of(self.scene, state, ctrl).replace(**forces)
-        stepped, tangent, growth = self.take(data, carry.tangent, carry.growth)
+        tangent, growth = carry.tangent, carry.growth
+        if tangent is None or growth is None:
+            stepped = step(model, data, contact=settings.contact)
+        else:
+            stepped, tangent, growth = self.measure(data, tangent, growth)
         moved = state_of(stepped)
-        is_bad = ~is_sound(moved, settings.velocity_limit)
+        is_bad = ~is_sound(moved)
         first_bad = jnp.where((carry.first_bad < 0) & is_bad, index, carry.first_bad)
         following = _Carry(
             jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved),
             None if carry.before is None else ctrl.astype(carry.before.dtype),
             first_bad,
             carry.unsolved + ((first_bad < 0) & (stepped._impl.solver_niter > model.opt.iterations)),
-            carry.crowded + ((first_bad < 0) & _is_crowded(model, jax.lax.stop_gradient(stepped), settings)),
+            carry.crowded + ((first_bad < 0) & _is_crowded(model, jax.lax.stop_gradient(stepped), settings.contact)),
             tangent,
             growth,
         )
         return following, (state.qpos, state.qvel, state.act, ctrl, self.look(state, ctrl, forces, stepped), seen)
 
-    def choose(self, seen: PyTree) -> Float[Array, " nu"]:
-        """Return the controls that the policy chooses."""
-        return one_each(self.policy(self.params, seen), self.scene.model.nu)  # pyright: ignore[reportOptionalCall]
-
-    def take(self, data: mjx.Data, tangent: tuple | None, growth: Array | None) -> tuple[mjx.Data, Any, Array | None]:
+    def measure(self, data: mjx.Data, tangent: tuple, growth: Array) -> tuple[mjx.Data, tuple[Array, Array], Array]:
         """Return the data after a step, the tangent there, and its largest norm so far."""
-        settings, model = self.settings, self.scene.model
-        how = {"gradient": settings.gradient, "onset": settings.onset, "smoothing": settings.smoothing}
-        if tangent is None or growth is None:
-            return step(model, data, **how), None, None
 
         def motion(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
-            stepped = step(model, data.replace(qpos=qpos, qvel=qvel), **how)
+            stepped = step(self.scene.model, data.replace(qpos=qpos, qvel=qvel), contact=self.settings.contact)
             return (stepped.qpos, stepped.qvel), stepped
 
         _, change, stepped = jax.jvp(motion, (data.qpos, data.qvel), tangent, has_aux=True)
@@ -126,9 +121,7 @@ class _Scan:
         model, data = self.scene.model, data_of(self.scene, state, ctrl).replace(**forces)
         has_stages = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         if stepped is None or has_stages:  # data of a multi-stage step belongs to its last stage
-            return self.observe(
-                model, forward(model, data, onset=self.settings.onset, smoothing=self.settings.smoothing)
-            )
+            return self.observe(model, forward(model, data, contact=self.settings.contact))
         at_start = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
         return self.observe(model, stepped.replace(**at_start))
 
@@ -142,17 +135,7 @@ def rolled_out(
     observe: Observe | None,
     settings: Settings,
 ) -> Trajectory:
-    """Return the result of `rollout` for checked arguments.
-
-    Args:
-        scene: the scene.
-        state: the initial state.
-        rows: controls, noise and inputs of each step.
-        policy: policy that replaces the rows of controls; None without one.
-        params: parameters of the policy.
-        observe: function from each state's model and data to the observations to keep.
-        settings: settings of the rollout.
-    """
+    """Return the result of `rollout` for checked arguments; `rows` are controls, noise and inputs of each step."""
     scan = _Scan(scene, policy, params, observe, settings)
     advance = scan.advance
     if settings.checkpoint:
@@ -190,10 +173,10 @@ def _has_numbers(scene: Scene) -> Bool[Array, ""]:
     return jnp.array(True) if not traced else ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced]))
 
 
-def _is_crowded(model: mjx.Model, data: mjx.Data, settings: Settings) -> Bool[Array, ""]:
+def _is_crowded(model: mjx.Model, data: mjx.Data, contact: Contact) -> Bool[Array, ""]:
     """Return whether contacts may have acted without a slot in the step behind this data."""
     if not data._impl.ncon or slot_geoms(model, data) is not None:
         return jnp.array(False)
-    if settings.smoothing is not None:
+    if isinstance(contact, Smoothing):
         return jnp.array(True)
-    return first_missed(model, data) < (0.0 if settings.onset is None else reach(model, data, settings.onset))
+    return first_missed(model, data) < (reach(model, data, contact) if isinstance(contact, Onset) else 0.0)

@@ -14,6 +14,8 @@ from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Gradient
 
+_Inputs = dict[str, Array]
+
 
 def rolled_out(
     scene: Scene,
@@ -21,56 +23,37 @@ def rolled_out(
     controls: Policy | Float[Array, "horizon nu"],
     params: PyTree,
     noise: Float[Array, "horizon nu"],
-    applied: dict[str, Array],
+    inputs: _Inputs,
     gradient: Gradient,
-    velocity_limit: float | None,
     *,
     measure_growth: bool,
 ) -> Trajectory:
     """Return C MuJoCo's rollout under controls, noise included, or a policy; the last good state is held."""
-    if callable(controls):
-        found = _by_policy(scene, state, controls, params, noise, applied, gradient, velocity_limit)
+    if not callable(controls):
+        found = _course(scene, state, controls, inputs, gradient)
     else:
-        found = _course(scene, state, controls, applied, gradient, velocity_limit)
-    growth = _growth(scene, state, found.ctrl, applied, gradient) if measure_growth else None
+
+        def advance(carry: tuple[State, Array], given: tuple[Array, Array, _Inputs]) -> tuple:
+            state, first_bad = carry
+            index, disturbance, row = given
+            ctrl = one_each(controls(params, state), scene.model.nu) + disturbance
+            one = _course(scene, state, ctrl[None], jax.tree.map(lambda x: x[None], row), gradient)
+            first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
+            moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
+            return (moved, first_bad), (state, ctrl)
+
+        # Step by step, since each control depends on the state before it.
+        rows = (jnp.arange(len(noise), dtype=jnp.int32), noise, inputs)
+        (final, first_bad), (states, ctrl) = jax.lax.scan(advance, (state, jnp.int32(-1)), rows)
+        states = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), states, final)
+        found = _trajectory(states, ctrl, first_bad)
+    growth = _growth(scene, state, found.ctrl, inputs, gradient) if measure_growth else None
     return dataclasses.replace(found, growth=growth)
-
-
-def _by_policy(
-    scene: Scene,
-    state: State,
-    policy: Policy,
-    params: PyTree,
-    noise: Float[Array, "horizon nu"],
-    applied: dict[str, Array],
-    gradient: Gradient,
-    velocity_limit: float | None,
-) -> Trajectory:
-    """Roll out step by step, since each control depends on the state before it."""
-
-    def advance(carry: tuple[State, Array], given: tuple[Array, Array, dict]) -> tuple:
-        state, first_bad = carry
-        index, disturbance, forces = given
-        ctrl = one_each(policy(params, state), scene.model.nu) + disturbance
-        forces = jax.tree.map(lambda x: x[None], forces)
-        one = _course(scene, state, ctrl[None], forces, gradient, velocity_limit)
-        first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
-        moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
-        return (moved, first_bad), (state, ctrl)
-
-    steps = jnp.arange(len(noise), dtype=jnp.int32)
-    (final, first_bad), (states, ctrl) = jax.lax.scan(advance, (state, jnp.int32(-1)), (steps, noise, applied))
-    return _trajectory(jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), states, final), ctrl, first_bad)
 
 
 @eqx.filter_jit
 def _course(
-    scene: Scene,
-    state: State,
-    ctrl: Float[Array, "horizon nu"],
-    applied: dict[str, Array],
-    gradient: Gradient,
-    velocity_limit: float | None,
+    scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: _Inputs, gradient: Gradient
 ) -> Trajectory:
     """Return the motion under known controls: one call of C MuJoCo."""
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
@@ -80,14 +63,14 @@ def _course(
         for name in INPUTS[1:]
         if getattr(scene.data, name).size
     }
-    found = roll_out(scene, start, given | applied | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
+    found = roll_out(scene, start, given | inputs | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
     qpos, qvel, act = (
         jnp.concatenate([first[None], rest])
         for first, rest in zip((state.qpos, state.qvel, state.act), found, strict=True)
     )
     time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
     states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
-    is_bad = ~(jax.vmap(lambda one: is_sound(one, velocity_limit))(states)[1:] & jnp.all(is_finite, axis=1))
+    is_bad = ~(jax.vmap(is_sound)(states)[1:] & jnp.all(is_finite, axis=1))
     first_bad = jnp.where(jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32), -1)
     kept = jnp.arange(len(ctrl) + 1)
     kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
@@ -99,16 +82,13 @@ def _trajectory(states: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[
     return Trajectory(states.qpos, states.qvel, ctrl, None, final, first_bad >= 0, first_bad, act=states.act)  # pyright: ignore[reportCallIssue]
 
 
-def _growth(scene: Scene, state: State, ctrl: Array, applied: dict[str, Array], gradient: Gradient) -> Float[Array, ""]:
+def _growth(scene: Scene, state: State, ctrl: Array, inputs: _Inputs, gradient: Gradient) -> Float[Array, ""]:
     """Return the growth of a tangent of the start; it has no derivative."""
-    given = (scene, state, ctrl, applied)
-    scene, state, ctrl, applied = jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, given
-    )
+    fixed = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x  # noqa: E731
+    scene, state, ctrl, inputs = jax.tree.map(fixed, (scene, state, ctrl, inputs))
 
     def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        start = dataclasses.replace(state, qpos=qpos, qvel=qvel)
-        found = _course(scene, start, ctrl, applied, gradient, None)
+        found = _course(scene, dataclasses.replace(state, qpos=qpos, qvel=qvel), ctrl, inputs, gradient)
         return found.qpos, found.qvel
 
     _, change = jax.jvp(course, (state.qpos, state.qvel), direction(state))

@@ -8,10 +8,10 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native import INPUTS
 from mjxgrad.native import linearise as by_mujoco
-from mjxgrad.rollouts.arguments import Engine
+from mjxgrad.rollouts.arguments import native_motion
 from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Gradient, Onset, step
+from mjxgrad.stepping import Contact, Slope, step
 
 
 class Linearisation(eqx.Module):
@@ -37,9 +37,7 @@ def linearise(
     state: State,
     ctrl: Float[ArrayLike, " nu"] | None = None,
     *,
-    gradient: Gradient = "slope",
-    onset: Onset | None = None,
-    engine: Engine | None = None,
+    contact: Contact = Slope(),
 ) -> Linearisation:
     """Return the linear model of one step; use `jax.vmap` for a batch of states.
 
@@ -47,24 +45,22 @@ def linearise(
         scene: from `load_scene`.
         state: the state before the step.
         ctrl: the controls; None for the scene's resting ones.
-        gradient: "slope" or "discrete", see `rollout`. The discrete one corresponds to `mjd_transitionFD`.
-        onset: onset of contacts within the step, see `rollout`; for MJX alone, with the gradient "discrete".
-        engine: "mjx" or "mujoco", see `rollout`; None is the scene's own.
+        contact: how contact is stepped, see `rollout`. The default is the model of the outcome; `mg.Discrete()` corresponds to
+            `mjd_transitionFD`.
 
     Raises:
         ValueError: as `rollout`.
     """
     ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
-    if (scene.engine if engine is None else engine) == "mujoco":
-        if onset is not None:
-            raise ValueError('engine="mujoco" is MuJoCo\'s own motion, got onset: leave it out')
+    native = native_motion(scene, contact)
+    if native is not None:
         start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
         inputs = {name: getattr(scene.data, name)[None] for name in INPUTS[1:] if getattr(scene.data, name).size}
-        found = by_mujoco(scene, start, inputs | {"ctrl": ctrl[None]}, gradient)
+        found = by_mujoco(scene, start, inputs | {"ctrl": ctrl[None]}, native.gradient)
         return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
     scene.check_mjx()
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
-    end = step(scene.model, data_of(scene, state, ctrl), gradient=gradient, onset=onset)
+    end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
 
     def moved(change: Float[Array, " both"]) -> tuple[Array, Array]:
         data = data_of(scene, state, ctrl + change[size:]).replace(
@@ -72,7 +68,7 @@ def linearise(
             qvel=state.qvel + change[nv : 2 * nv],
             act=state.act + change[2 * nv : size],
         )
-        found = step(scene.model, data, gradient=gradient, onset=onset)
+        found = step(scene.model, data, contact=contact)
         return jnp.concatenate(
             [position_change(scene.model, end.qpos, found.qpos), found.qvel, found.act]
         ), found.sensordata

@@ -15,6 +15,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import geom_name
 from mjxgrad.scene import Scene, SceneWarning
 
+VELOCITY_LIMIT = 1e4  # m/s or rad/s, beyond which a rollout counts as diverged
 _DEEP = 0.02  # m, largest penetration of a pose without a warning
 _NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 
@@ -138,12 +139,11 @@ def state_of(data: mjx.Data) -> State:
     return State(data.qpos, data.qvel, data.act, data.time, data.qacc_warmstart)
 
 
-def is_sound(state: State, velocity_limit: float | None) -> Bool[Array, ""]:
+def is_sound(state: State) -> Bool[Array, ""]:
     """Return whether a state is finite and below the velocity limit."""
-    limit = jnp.inf if velocity_limit is None else velocity_limit
     numbers = jnp.concatenate([state.qpos, state.act])
     # A comparison with NaN is false, so one test finds both.
-    return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < limit)
+    return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < VELOCITY_LIMIT)
 
 
 def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:

@@ -69,6 +69,6 @@ def check_trajectory(trajectory: Trajectory) -> None:
     first = int(jnp.min(jnp.where(diverged, jnp.atleast_1d(trajectory.first_bad_step), 2**30)))
     raise DivergedError(
         f"{int(diverged.sum())} of {diverged.size} rollouts diverged, the earliest in step {first}: "
-        "the state must stay finite and below the velocity limit; shorten the time step, soften the contact, "
+        "the state must stay finite and below 10 000 m/s or rad/s; shorten the time step, soften the contact, "
         "or look for a non-finite control"
     )

@@ -1,17 +1,34 @@
 """The differentiable step: rows of contacts, limits and equalities, time integration, onset and smoothing."""
 
-from mjxgrad.stepping.onset import Onset
+from mjxgrad.stepping.contact import (
+    Contact,
+    Discrete,
+    Engine,
+    Gradient,
+    Onset,
+    OwnMotion,
+    Slope,
+    Smoothing,
+    check_contact,
+    own_motion,
+)
 from mjxgrad.stepping.rows import contact_force
-from mjxgrad.stepping.smoothing import Smoothing, smoothing_warnings
-from mjxgrad.stepping.step import Gradient, check_gradient, forward, solve, step
+from mjxgrad.stepping.smoothing import smoothing_warnings
+from mjxgrad.stepping.step import forward, solve, step
 
 __all__ = [
+    "Contact",
+    "Discrete",
+    "Engine",
     "Gradient",
     "Onset",
+    "OwnMotion",
+    "Slope",
     "Smoothing",
-    "check_gradient",
+    "check_contact",
     "contact_force",
     "forward",
+    "own_motion",
     "smoothing_warnings",
     "solve",
     "step",

@@ -73,19 +73,9 @@ def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None
     return data.tree_replace({f"_impl.efc_{name}": value for name, value in fields.items()})  # pyright: ignore[reportReturnType]
 
 
-def system_of(
-    model: mjx.Model,
-    data: mjx.Data,
-    layout: RowLayout,
-    block: Block,
-    noise: Noise | None = None,
-    velocity: Float[Array, " nv"] | None = None,
-) -> System:
-    """Return the equations of motion of a state from its smooth forces, its rows, and noise on them.
-
-    The rows' reference acceleration is taken at `velocity`, by default that of the state.
-    """
-    reference, weight = rows.law(model, data.qvel if velocity is None else velocity, block)
+def system_of(model: mjx.Model, data: mjx.Data, layout: RowLayout, block: Block, noise: Noise | None = None) -> System:
+    """Return the equations of motion of a state from its smooth forces, its rows, and noise on them."""
+    reference, weight = rows.law(model, data.qvel, block)
     laws = Rows(reference, weight, block.friction_loss, cone_scales(model, data, layout), noise)
     return System(inertia_of(model, data), data.qfrc_smooth, block.map, block.is_active, laws)  # pyright: ignore[reportArgumentType]
 

@@ -119,16 +119,6 @@ class Onset(eqx.Module):
             given = np.asarray(self.width)
             raise ValueError(f"width must be finite and not negative, got {given!s}: 0.1 is the default, 0 no floor")
 
-    def check(self, gradient: str) -> None:
-        """Refuse a width with a leading axis, and the gradient "slope"."""
-        if self.width.ndim:
-            raise ValueError(f"width must be one value for a step, got shape {self.width.shape}: sweep under jax.vmap")
-        if gradient == "slope":
-            raise ValueError(
-                "gradient must be 'discrete' with an onset, got 'slope': that one is for MuJoCo's motion to the bit, "
-                "onset=None; a motion without jumps has the slope as its plain derivative"
-            )
-
 
 def reach(model: mjx.Model, data: mjx.Data, onset: Onset) -> Float[Array, ""]:
     """Return the distance less the margin beyond which no contact acts in the coming step (m).
@@ -203,24 +193,17 @@ class TwoSolves(eqx.Module):
 
 
 def begin(
-    model: mjx.Model,
-    data: mjx.Data,
-    blocks: list[Block],
-    onset: Onset,
-    after: _Vector | None = None,
-    *,
-    without: tuple[bool, bool] = (False, False),
-) -> tuple[list[Block], Shares | None]:
-    """Return rows that are active if they act for any part of the step, and their shares; None if no row begins or ends.
+    model: mjx.Model, data: mjx.Data, blocks: list[Block], how: Onset | _Vector
+) -> tuple[list[Block], TwoSolves | None]:
+    """Return rows that are active if they act for any part of the step, and its two solves; None if no row begins or ends.
 
-    With `after`, the velocity after MuJoCo's step, the shares belong to MuJoCo's own motion, for a derivative there.
-    `without` says whether contacts, and limits, stay unchanged, as smoothing averages them over noise.
+    The shares are those of an onset; or, with the velocity after MuJoCo's step, of MuJoCo's own motion, for a derivative there.
     """
     if not any(block.rows_each for block in blocks):
         return blocks, None
     found, sides, rows, num_contacts = [], [], [], 0
     for block in blocks:
-        if not block.rows_each or without[not block.is_contact]:
+        if not block.rows_each:
             rows.append(block)
             found.append(jnp.ones_like(block.residual))
             sides.append(None)
@@ -228,20 +211,17 @@ def begin(
         each, count = block.rows_each, len(block.residual) // block.rows_each
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
-        share, side = _share(model, data, block, onset, geoms, after)
+        share, side = _share(model, data, block, how, geoms)
         share = per_row(share, each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(dataclasses.replace(block, is_active=share > 0, impedance=impedance))
         found.append(share)
         sides.append(side)
-    return rows, _split(blocks, found, sides)
+    return rows, _two_solves(model, data, rows, _split(blocks, found, sides))
 
 
-def two_solves(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares | None) -> TwoSolves | None:
-    """Return the two solves of a step from the rows and shares of `begin`; the rows may be under noise."""
-    if shares is None:
-        return None
+def _two_solves(model: mjx.Model, data: mjx.Data, blocks: list[Block], shares: Shares) -> TwoSolves:
     rows = joined(blocks)
 
     def weigh(share: _PerRow) -> _PerRow:
@@ -268,12 +248,39 @@ class _Side(eqx.Module):
 
 
 def _share(
-    model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, contacts: slice | None, after: _Vector | None
+    model: mjx.Model, data: mjx.Data, block: Block, how: Onset | _Vector, contacts: slice | None
 ) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and its other side; None where no sides can change."""
+    rates = block.map.mv(data.qvel).reshape(-1, block.rows_each)
+    rate, distance = _normal(block, rates), block.residual[:: block.rows_each]
+    travel = model.opt.timestep * jnp.abs(rate)
+    if isinstance(how, Onset):
+        least = _least_width(model, data, block, how, rates, rate)
+        width = jnp.where(travel > least, travel, least)
+        slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
+        distance = distance + model.opt.timestep * rate * slow
+    else:
+        least = 2 * _AT_MOTION * _depth(block.solimp[:: block.rows_each])
+        ahead = model.opt.timestep * jnp.abs(_normal(block, block.map.mv(how).reshape(-1, block.rows_each)))
+        width = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(travel, ahead), least))
+    if contacts is None:
+        return _ramp(distance, width, 0.5), None
+    slots = slot_geoms(model, data)
+    geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
+    share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
+    return share, _side(model, data, block, contacts, geoms, rate, least)
+
+
+def _least_width(
+    model: mjx.Model,
+    data: mjx.Data,
+    block: Block,
+    onset: Onset,
+    rates: Float[Array, "contacts each"],
+    rate: _PerContact,
+) -> _PerContact:
+    """Return the floor √(h²u² + w₀²) of an onset's ramp, for contacts that graze or chatter."""
     each, h = block.rows_each, model.opt.timestep
-    rates = block.map.mv(data.qvel).reshape(-1, each)
-    rate = _normal(block, rates)
     stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
     press = jnp.abs(_normal(block, block.map.mv(data.qacc_smooth).reshape(-1, each))) - gravity
@@ -286,21 +293,7 @@ def _share(
     floor = onset.width.astype(rate.dtype) * depth
     # Six times the speed of a fall over such a length: with three, derivatives of a pushed ball scatter twice as much.
     chatters = _is_slow(rate, 6 * safe_sqrt(jnp.where(gravity > 0, gravity, _GRAVITY) * floor))
-    travel, least = h * jnp.abs(rate), safe_sqrt((h * creep) ** 2 + chatters * floor**2)
-    width = jnp.where(travel > least, travel, least)
-    slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
-    distance = block.residual[::each] + h * rate * slow
-    if after is not None:
-        least = 2 * _AT_MOTION * depth
-        ahead = h * jnp.abs(_normal(block, block.map.mv(after).reshape(-1, each)))
-        width = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(travel, ahead), least))
-        distance = block.residual[::each]
-    if contacts is None:
-        return _ramp(distance, width, 0.5), None
-    slots = slot_geoms(model, data)
-    geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
-    share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
-    return share, _side(model, data, block, contacts, geoms, rate, least)
+    return safe_sqrt((h * creep) ** 2 + chatters * floor**2)
 
 
 def _normal(block: Block, rates: Float[Array, "contacts each"]) -> _PerContact:

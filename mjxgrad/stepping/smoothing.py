@@ -86,7 +86,7 @@ class Smoothing(eqx.Module):
         for name, choices in (("kernel", tuple(KERNELS)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
-        without = "for a step without smoothing give smoothing=None"
+        without = "for MuJoCo's own motion take mg.Discrete()"
         for name, remedy in (("length", without), ("limit_length", "None leaves limits alone")):
             value = getattr(self, name)
             if is_known(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
@@ -96,13 +96,6 @@ class Smoothing(eqx.Module):
     def noise(self) -> Kernel:
         """Return the kernel, in units of the length."""
         return KERNELS[self.kernel]
-
-    def check(self, _: str) -> None:
-        """Refuse lengths with a leading axis."""
-        for name in ("length", "limit_length"):
-            value = getattr(self, name)
-            if value is not None and value.ndim:
-                raise ValueError(f"{name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap")
 
 
 def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:

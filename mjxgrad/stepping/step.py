@@ -10,12 +10,12 @@ Matrix products request full precision: NVIDIA GPUs otherwise round factors to t
 
 import contextlib
 from collections.abc import Iterator
-from typing import Literal, get_args
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
@@ -27,18 +27,15 @@ from mjxgrad.solver import implicit
 from mjxgrad.solver.constraint import RowLayout, Rows
 from mjxgrad.solver.jacobian import DenseRows, JoinedRows
 from mjxgrad.solver.newton import System, Variant
-from mjxgrad.stepping import assembly
-from mjxgrad.stepping import onset as onsets
-from mjxgrad.stepping.onset import Onset, Shares, TwoSolves
+from mjxgrad.stepping import assembly, onset
+from mjxgrad.stepping.contact import Contact, Discrete, Onset, Slope, Smoothing, check_contact
+from mjxgrad.stepping.onset import TwoSolves
 from mjxgrad.stepping.rows import Block, joined
-from mjxgrad.stepping.smoothing import Smoothing, smoothed
+from mjxgrad.stepping.smoothing import smoothed
 
 _Vector = Float[Array, " nv"]
 _Disable = mujoco.mjtDisableBit
 _Integrator = mujoco.mjtIntegrator
-
-Gradient = Literal["discrete", "slope"]
-"""Derivatives along MuJoCo's own motion: "discrete", of each step, or "slope", with the slope of the outcome as mean."""
 
 
 @contextlib.contextmanager
@@ -56,40 +53,13 @@ def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
         yield
 
 
-def check_gradient(gradient: str, onset: Onset | None = None, smoothing: Smoothing | None = None) -> None:
-    """Refuse an unknown gradient, and an onset or smoothing that a single step cannot use with it.
-
-    Raises:
-        ValueError: if the gradient is unknown, or onset or smoothing are of another type, have a leading axis or conflict.
-    """
-    if gradient not in get_args(Gradient):
-        raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
-    for name, kind, settings in (("smoothing", Smoothing, smoothing), ("onset", Onset, onset)):
-        if settings is not None and not isinstance(settings, kind):
-            raise ValueError(f"{name} must be an mg.{kind.__name__}() or None, got {settings!r}")
-        if settings is not None:
-            settings.check(gradient)
-
-
-def step(
-    model: mjx.Model,
-    data: mjx.Data,
-    *,
-    gradient: Gradient = "discrete",
-    onset: Onset | None = None,
-    smoothing: Smoothing | None = None,
-) -> mjx.Data:
+def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> mjx.Data:
     """Advance the state by one time step.
 
     Args:
         model: any model of MJX's JAX implementation; Euler, implicitfast or RK4.
         data: the present state, controls and applied forces.
-        gradient: "discrete", the exact derivative of the simulated map, or "slope", which includes the motion of the times at
-            which contacts and limits begin and end. "slope" is the derivative of the step with an onset, along MuJoCo's own
-            motion. The step itself is the same.
-        onset: lets contacts and limits begin within the step, so that the motion has no jumps and its plain derivative is
-            unbiased; see `stepping.onset`. None is MuJoCo's step.
-        smoothing: averages every contact over noise on its distance, for the motion or for its derivative alone.
+        contact: how contact is stepped; see `stepping.contact`. The default is `mjx.step`'s motion, with its derivative.
 
     Returns:
         Data whose state is one time step later and whose other fields are those of the present state, as `mjx.step` returns
@@ -98,84 +68,81 @@ def step(
         where the iterations, or the digits of the precision, did not suffice.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, the gradient is unknown, onset or smoothing
-            have a leading axis, or an onset is combined with the gradient "slope".
+        ValueError: if `model` or `data` belong to another implementation of MJX, or contact is none of the four records, has
+            a leading axis, or asks for C MuJoCo.
         NotImplementedError: if MJX lacks the integrator.
     """
-    check_gradient(gradient, onset, smoothing)
+    check_contact(contact, is_step=True)
     if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
         kind = model.opt.integrator
         raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
     with _at_full_precision(model, data):
-        if gradient == "discrete":
-            return _step(model, data, onset, smoothing)
-        moved = _step(*jax.lax.stop_gradient((model, data)), onset, smoothing)
-        return jax.tree.map(_with_derivative_of, moved, _step(model, data, Onset(), smoothing, moved.qvel))
+        if not isinstance(contact, Slope):
+            return _step(model, data, contact)
+        moved = _step(*jax.lax.stop_gradient((model, data)), Discrete())
+        return jax.tree.map(_with_derivative_of, moved, _step(model, data, contact, moved.qvel))
 
 
-def _step(
-    model: mjx.Model,
-    data: mjx.Data,
-    onset: Onset | None,
-    smoothing: Smoothing | None,
-    after: _Vector | None = None,
-) -> mjx.Data:
-    integrator = model.opt.integrator
-    if integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data, onset, smoothing, after)
-    data = _forward(model, data, onset, smoothing, after)
-    is_euler = integrator == _Integrator.mjINT_EULER
+def _step(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector | None = None) -> mjx.Data:
+    """Return data one step later; `after` is that of `_forward`."""
+    if model.opt.integrator == _Integrator.mjINT_RK4:
+        return _runge_kutta(model, data, contact, after)
+    data = _forward(model, data, contact, after)
+    is_euler = model.opt.integrator == _Integrator.mjINT_EULER
     return _advance(model, data, (_euler_acceleration if is_euler else _implicit_acceleration)(model, data), None)
 
 
-def forward(
-    model: mjx.Model, data: mjx.Data, *, onset: Onset | None = None, smoothing: Smoothing | None = None
-) -> mjx.Data:
+def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> mjx.Data:
     """Compute accelerations and forces of the present state; a drop-in for `mjx.forward`.
 
     Args:
         model: any model of MJX's JAX implementation.
         data: the present state, controls and applied forces.
-        onset: the onset of `step`; accelerations and forces are then means over the coming time step.
-        smoothing: the smoothing of `step`.
+        contact: how contact is stepped, as in `step`. With an onset, accelerations and forces are means over the coming time
+            step. `Slope` is `Discrete` here, since it is a derivative of whole steps.
 
     Returns:
         Data with every field that depends on the state filled in. Under forward smoothing the constraint rows (`efc_`) are the
         smoothed ones, present at any distance.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, or onset or smoothing
-            have a leading axis.
+        ValueError: as `step`.
     """
-    check_gradient("discrete", onset, smoothing)
+    check_contact(contact, is_step=True)
     with _at_full_precision(model, data):
-        return _forward(model, data, onset, smoothing)
+        return _forward(model, data, contact)
 
 
-def _forward(
-    model: mjx.Model,
-    data: mjx.Data,
-    onset: Onset | None,
-    smoothing: Smoothing | None,
-    after: _Vector | None = None,
-) -> mjx.Data:
-    """Return data with all fields that depend on the state; `after` is that of `onset.begin`."""
-    data, blocks = _smooth(model, data)
-    rows, shares = blocks, None
-    if onset is not None:
-        averaged = (False, False)
-        if smoothing is not None and smoothing.mode == "forward":
-            averaged = (True, smoothing.limit_length is not None)
-        rows, shares = onsets.begin(model, data, blocks, onset, after, without=averaged)
+def _forward(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector | None = None) -> mjx.Data:
+    """Return data with all fields that depend on the state.
+
+    With `after`, the velocity after MuJoCo's step, the result has the derivative of `Slope`; its values are not used.
+    """
+    if isinstance(contact, Smoothing) and contact.mode == "backward":
+        own = _forward(*jax.lax.stop_gradient((model, data)), Discrete())
+        begun = data.replace(qacc_warmstart=own.qacc)
+        return jax.tree.map(_with_derivative_of, own, _forward(model, begun, replace(contact, mode="forward")))
+    data, rows = _smooth(model, data)
+    layout, noise, solves = assembly.row_layout(model, data), None, None
+    if isinstance(contact, Smoothing):
+        rows, noise, layout = smoothed(model, data, rows, contact, layout)
+    elif (how := contact if isinstance(contact, Onset) else after) is not None:
+        rows, solves = onset.begin(model, data, rows, how)
     data = assembly.make_constraint(model, data, rows)
     if model.nsensor:
         data = mended.sensor_vel(model, mended.sensor_pos(model, data))
-    if smoothing is None:
-        data = _minimum(
-            model, data, *_system(model, data, rows), _start(model, data), onsets.two_solves(model, data, rows, shares)
-        )
+    if not rows or not layout.num_rows or not model.nv:
+        data = _unconstrained(data)
     else:
-        data = _smoothed_solve(model, data, blocks, rows, shares, smoothing)
+        system = assembly.system_of(model, data, layout, joined(rows), noise)
+        iterations, start, tolerance = _solver_settings(model, data)
+        if solves is None:
+            found = implicit.solve(layout, iterations, system, start, tolerance)
+            data = _solved(data, layout, system, *found)
+        else:
+            pair = (solves.variants, solves.is_split)
+            found = implicit.solve_both(layout, iterations, system, *pair, start, tolerance)
+            data = _mixed(data, layout, system, solves, *found)
     return mended.sensor_acc(model, data) if model.nsensor else data
 
 
@@ -200,48 +167,59 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
         active = jnp.ones(layout.num_rows, bool)
         system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
-        return _minimum(model, data, layout, system, _start(model, data))
+        if not layout.num_rows or not model.nv:
+            return _unconstrained(data)
+        iterations, start, tolerance = _solver_settings(model, data)
+        return _solved(data, layout, system, *implicit.solve(layout, iterations, system, start, tolerance))
 
 
-def _system(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> tuple[RowLayout, System | None]:
-    """Return the layout of the rows and the equations of motion; None in place of these without rows."""
-    layout = assembly.row_layout(model, data)
-    return layout, assembly.system_of(model, data, layout, joined(blocks)) if blocks else None
+def _solver_settings(model: mjx.Model, data: mjx.Data) -> tuple[int, _Vector, Float[Array, ""]]:
+    """Return the limit on iterations, the start of the solve, and its tolerance."""
+    is_cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
+    start = jax.lax.stop_gradient(data.qacc_smooth if is_cold else data.qacc_warmstart)
+    return int(model.opt.iterations), start, jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
 
 
-def _start(model: mjx.Model, data: mjx.Data) -> _Vector:
-    return data.qacc_smooth if model.opt.disableflags & _Disable.mjDSBL_WARMSTART else data.qacc_warmstart
+def _unconstrained(data: mjx.Data) -> mjx.Data:
+    """Return data with the acceleration without constraints."""
+    data = data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
+    return data.tree_replace({"_impl.solver_niter": jnp.zeros_like(data._impl.solver_niter)})  # pyright: ignore[reportReturnType]
 
 
-def _smoothed_solve(
-    model: mjx.Model,
-    data: mjx.Data,
-    blocks: list[Block],
-    begun: list[Block],
-    shares: Shares | None,
-    smoothing: Smoothing,
+def _solved(
+    data: mjx.Data, layout: RowLayout, system: System, acceleration: _Vector, num_iterations: Int[Array, ""]
 ) -> mjx.Data:
-    """Solve with rows under noise; in backward mode solve without noise and use noise for the derivative only.
+    """Return data with the acceleration that balances all forces, and the forces of the rows."""
+    force = system.row_force(layout, acceleration)
+    return _with_forces(data, acceleration, force, system.rmv(force), num_iterations)
 
-    `blocks` are MuJoCo's rows, `begun` and `shares` the rows and shares with an onset.
-    """
-    is_forward = smoothing.mode == "forward"
-    layout = assembly.row_layout(model, data)
-    blocks, uncertain, layout = smoothed(model, data, begun if is_forward else blocks, smoothing, layout)
-    solves = onsets.two_solves(model, data, blocks if is_forward else begun, shares)
-    if uncertain is None or not model.nv:
-        return _minimum(model, data, *_system(model, data, begun), _start(model, data), solves)
-    soft = assembly.make_constraint(model, data, blocks)
-    system = assembly.system_of(model, data, layout, joined(blocks), uncertain)
-    if is_forward:
-        return _minimum(model, soft, layout, system, _start(model, data), solves)
-    fixed_model, fixed_data, given, solves = jax.lax.stop_gradient((model, data, begun, solves))
-    hard = _minimum(fixed_model, fixed_data, *_system(fixed_model, fixed_data, given), _start(model, data), solves)
-    soft = _minimum(model, soft, layout, system, hard.qacc)
 
-    found = [(one.qacc, one.qfrc_constraint, one._impl.efc_force) for one in (hard, soft)]
-    acceleration, total, force = _with_derivative_of(*found)
-    return _solved(data, acceleration, total, force, hard._impl.solver_niter)
+def _mixed(
+    data: mjx.Data,
+    layout: RowLayout,
+    system: System,
+    solves: TwoSolves,
+    both: Float[Array, "2 nv"],
+    num_iterations: Int[Array, ""],
+) -> mjx.Data:
+    """Return data with the mean of two solves, weighted by the share of the first."""
+
+    def forces(variant: Variant, acceleration: Array) -> tuple[Array, Array]:
+        varied = system.with_variant(variant)
+        force = varied.row_force(layout, acceleration)
+        return force, varied.rmv(force)
+
+    # In this order the result equals a single solve to the last bit where the two do not differ.
+    acceleration, force, total = (
+        x[1] + solves.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(solves.variants, both))
+    )
+    return _with_forces(data, acceleration, force, total, num_iterations)
+
+
+def _with_forces(data: mjx.Data, acceleration: Array, force: Array, total: Array, num_iterations: Array) -> mjx.Data:
+    count = num_iterations.astype(data._impl.solver_niter.dtype)
+    found = {"_impl.efc_force": force, "_impl.solver_niter": count}
+    return data.tree_replace({"qacc": acceleration, "qfrc_constraint": total, **found})  # pyright: ignore[reportReturnType]
 
 
 @jax.custom_jvp
@@ -253,48 +231,6 @@ def _with_derivative_of(value, other):
 @_with_derivative_of.defjvp
 def _with_derivative_of_jvp(primals, tangents):
     return _with_derivative_of(*primals), tangents[1]
-
-
-def _minimum(
-    model: mjx.Model,
-    data: mjx.Data,
-    layout: RowLayout,
-    system: System | None,
-    start: _Vector,
-    solves: TwoSolves | None = None,
-) -> mjx.Data:
-    """Return data with the acceleration that balances all forces, and the forces of the rows."""
-    if system is None or not layout.num_rows or not model.nv:
-        data = data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
-        none = jnp.zeros_like(data._impl.solver_niter)
-        return data.tree_replace({"_impl.solver_niter": none})  # pyright: ignore[reportReturnType]
-    tolerance = jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
-    iterations = int(model.opt.iterations)
-    start = jax.lax.stop_gradient(start)
-    if solves is None:
-        acceleration, num_iterations = implicit.solve(layout, iterations, system, start, tolerance)
-        force = system.row_force(layout, acceleration)
-        total = system.rmv(force)
-    else:
-        both, num_iterations = implicit.solve_both(
-            layout, iterations, system, solves.variants, solves.is_split, start, tolerance
-        )
-
-        def forces(variant: Variant, acceleration: Array) -> tuple[Array, Array]:
-            varied = system.with_variant(variant)
-            force = varied.row_force(layout, acceleration)
-            return force, varied.rmv(force)
-
-        # In this order the result equals a single solve to the last bit where the two do not differ.
-        acceleration, force, total = (
-            x[1] + solves.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(solves.variants, both))
-        )
-    return _solved(data, acceleration, total, force, num_iterations.astype(data._impl.solver_niter.dtype))
-
-
-def _solved(data: mjx.Data, acceleration: Array, total: Array, force: Array, num_iterations: Array) -> mjx.Data:
-    found = {"_impl.efc_force": force, "_impl.solver_niter": num_iterations}
-    return data.tree_replace({"qacc": acceleration, "qfrc_constraint": total, **found})  # pyright: ignore[reportReturnType]
 
 
 def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
@@ -343,9 +279,7 @@ def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: 
     return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
 
 
-def _runge_kutta(
-    model: mjx.Model, start: mjx.Data, onset: Onset | None, smoothing: Smoothing | None, after: _Vector | None
-) -> mjx.Data:
+def _runge_kutta(model: mjx.Model, start: mjx.Data, contact: Contact, after: _Vector | None) -> mjx.Data:
     """Advance by the classical fourth-order rule.
 
     All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
@@ -363,7 +297,7 @@ def _runge_kutta(
             time=start.time + h * share,
             qacc_warmstart=warm,
         )
-        data = _forward(model, data, onset, smoothing, after)
+        data = _forward(model, data, contact, after)
         rates = (data.qvel, data.qacc, data.act_dot)
         sums = tuple(s + weight * r for s, r in zip(sums, rates, strict=True))
         return (rates, sums, data.qacc), data

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from mjxgrad.objective.task import InScene, finite_cost
-from mjxgrad.rollouts import Trajectory, initial_state, rollout
+from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks.action_task import scene_path
 
@@ -36,15 +36,13 @@ class BallWall(InScene):
     target: Float[Array, ""]
     horizon: int = eqx.field(static=True)
 
-    def trajectory(self, angle: Float[Array, " 1"]) -> Trajectory:
-        """Return the trajectory of a throw at an angle above the floor, in rad."""
-        qvel = self.speed * jnp.array([jnp.cos(angle[0]), jnp.sin(angle[0])])
-        start = initial_state(self.scene, qvel=qvel)
-        return rollout(self.scene, start, horizon=self.horizon, gradient=self.gradient, onset=self.onset)
+    def start(self, angle: Float[Array, " 1"]) -> State:
+        """Return the start of a throw at an angle above the floor, in rad."""
+        return initial_state(self.scene, qvel=self.speed * jnp.array([jnp.cos(angle[0]), jnp.sin(angle[0])]))
 
     def cost(self, angle: Float[Array, " 1"]) -> Float[Array, ""]:
         """Return the squared distance from the ball's end to the target, in m²; NaN if the rollout diverged."""
-        trajectory = self.trajectory(angle)
+        trajectory = rollout(self.scene, self.start(angle), horizon=self.horizon, contact=self.contact)
         return finite_cost((trajectory.qpos[-1, 0] - self.target) ** 2, trajectory)
 
     def objective(self, stddev: float | Float[Array, ""] = 0.1, softness: Softness | None = None) -> ParameterNoise:

@@ -253,9 +253,8 @@ def test_both_engines_move_alike():
 def test_a_fine_motion_is_that_of_a_shorter_time_step():
     scene = mg.load_scene(ball(height=0.06), timestep=0.002 / REFINED)
     for speed, found in zip((-1.0, -2.0, 0.5), _moved("mujoco", "fine").outcomes, strict=True):
-        course = mg.rollout(
-            scene, mg.initial_state(scene, qvel=np.array([speed])), horizon=20 * REFINED, engine="mujoco"
-        )
+        start, by_c = mg.initial_state(scene, qvel=np.array([speed])), mg.Discrete("mujoco")
+        course = mg.rollout(scene, start, horizon=20 * REFINED, contact=by_c)
         np.testing.assert_allclose(found[-1], [course.qpos[-1, 0], course.qvel[-1, 0]], rtol=1e-6)
 
 

@@ -52,15 +52,19 @@ def swept(folder):
         noise=0.5,
         num_samples=64,
         num_reference=512,
-        gradient="discrete",
+        contact=mg.Discrete(),
     )
 
 
 def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
     """By differences of the mean over common noise, a twentieth of its standard deviation to both sides."""
     scene = mg.load_scene(folder / "block.xml")
-    task = scene_task(scene, f"{folder}/costs.py:reward", start="near", horizon=40, gradient="discrete")
-    knob, keys, width = Knob(task.with_engine("mujoco"), 0.5), jax.random.split(jax.random.key(5), 2000), 0.025
+    task = scene_task(scene, f"{folder}/costs.py:reward", start="near", horizon=40, contact=mg.Discrete())
+    knob, keys, width = (
+        Knob(task.with_contact(mg.Discrete("mujoco")), 0.5),
+        jax.random.split(jax.random.key(5), 2000),
+        0.025,
+    )
     table = swept.result.table()
     for row, stiffness in enumerate(swept.result.knob[1][:2]):
         objective = knob(mg.Softness(stiffness=stiffness))
@@ -150,7 +154,9 @@ def test_derivatives_by_the_push_are_those_by_all_controls_along_it(folder):
 
 def test_costs_by_name_are_what_c_mujoco_says(folder):
     scene = mg.load_scene(folder / "block.xml")
-    moved = mg.rollout(scene, mg.initial_state(scene, qpos=jnp.array([0.05])), jnp.ones((20, 1)), engine="mujoco")
+    moved = mg.rollout(
+        scene, mg.initial_state(scene, qpos=jnp.array([0.05])), jnp.ones((20, 1)), contact=mg.Discrete("mujoco")
+    )
     data = mujoco.MjData(scene.mj_model)
     data.qpos[:] = moved.qpos[-1]
     mujoco.mj_kinematics(scene.mj_model, data)

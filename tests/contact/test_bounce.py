@@ -7,6 +7,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.contact.bounce import Bounce
+from mjxgrad.stepping import own_motion
 
 DURATION = 0.1
 TIMESTEP = 5e-4
@@ -25,7 +26,7 @@ def found():
 
     def height(start, gradient):
         state = mg.initial_state(scene, qpos=start[None], qvel=jnp.array([-1.0]))
-        return mg.rollout(scene, state, horizon=round(DURATION / TIMESTEP), gradient=gradient).qpos[-1, 0]
+        return mg.rollout(scene, state, horizon=round(DURATION / TIMESTEP), contact=own_motion(gradient)).qpos[-1, 0]
 
     return mg.diagnostics.derivative_against_slope(height, (0.005, 0.025), num_phases=64)
 

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.rollouts import rollout
 from mjxgrad.scene import load_scene
+from mjxgrad.stepping import Discrete
 from mjxgrad.tasks import scene_path
 
 ACTIONS = jnp.array([[0.7], [-0.4], [0.9], [0.2]])
@@ -75,7 +76,7 @@ def placed(state, *, qpos=None, qvel=None, num_steps=0):
 def test_steps_are_those_of_a_rollout_of_the_controls(cart, state, step):
     """To the order of additions: a scan of two steps, twice, is compiled apart from one of four."""
     controls = jnp.repeat(jax.vmap(cart.control)(ACTIONS[:2]), 2, axis=0)
-    course = jax.jit(lambda start: rollout(cart.scene, start, controls, onset=cart.onset))(state.physics)
+    course = jax.jit(lambda start: rollout(cart.scene, start, controls, contact=cart.contact))(state.physics)
     first = step(state, ACTIONS[0])
     second = step(first, ACTIONS[1])
     for index, reached in ((2, first), (4, second)):
@@ -113,7 +114,7 @@ def test_an_end_for_good_terminates_and_is_not_truncated_even_in_the_last_step(s
 
 def test_refined_an_action_takes_as_long_in_shorter_steps(cart, state):
     """Against C MuJoCo in steps of a quarter, eight of them for two, from the same state."""
-    found = jax.jit(lambda state: cart.refined(4).with_engine("mujoco").step(state, ACTIONS[0]))(state)
+    found = jax.jit(lambda state: cart.refined(4).with_contact(Discrete("mujoco")).step(state, ACTIONS[0]))(state)
     model = cart.scene.to_mujoco()
     model.opt.timestep /= 4
     data = mujoco.MjData(model)

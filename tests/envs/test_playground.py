@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mjxgrad.envs import playground
-from mjxgrad.stepping import Onset
+from mjxgrad.stepping import Slope
 
 # How many actions, and what is to be known: noise on observations and pushes have keys of their own.
 NAMES = {
@@ -53,9 +53,9 @@ def test_the_step_is_ours_inside_and_theirs_outside(falling, monkeypatch):
     thing, data = falling
     theirs, counted = mujoco.mjx.step, []
     monkeypatch.setattr(playground, "step", lambda model, data, **settings: counted.append(settings) or data)
-    right = playground.stepped_right(thing, gradient="slope")
+    right = playground.stepped_right(thing, contact=Slope())
     right.step(data)
-    assert counted == [{"gradient": "slope", "onset": None, "smoothing": None}]
+    assert counted == [{"contact": Slope()}]
     assert mujoco.mjx.step is theirs
 
 
@@ -79,9 +79,9 @@ def test_other_threads_step_as_ever(falling, monkeypatch):
     assert len(results) == 1
 
 
-def test_a_gradient_that_does_not_go_with_an_onset_is_refused_at_once(falling):
-    with pytest.raises(ValueError, match="onset"):
-        playground.stepped_right(falling[0], gradient="slope", onset=Onset())
+def test_c_mujoco_is_refused_at_once(falling):
+    with pytest.raises(ValueError, match=r'got "mujoco": use mg\.rollout'):
+        playground.stepped_right(falling[0], contact=Slope("mujoco"))
 
 
 @pytest.fixture(scope="module")

@@ -140,12 +140,13 @@ def test_through_a_bounce_the_search_converges_with_an_onset_and_stalls_without(
         return {"body_pos": model.body_pos.at[1, 2].set(height)}
 
     found = {}
-    for name, onset in (("onset", mg.Onset()), ("discrete", None)):
+    for name, contact in (("onset", mg.Onset()), ("discrete", mg.Discrete())):
         start = mg.initial_state(scene, qvel=jnp.array([-1.0]))
-        course = mg.rollout(scene.with_model(**raised(scene.model, 0.25)), start, horizon=150, onset=onset).qpos + 0.25
+        there = scene.with_model(**raised(scene.model, 0.25))
+        course = mg.rollout(there, start, horizon=150, contact=contact).qpos + 0.25
         measured = np.column_stack([np.zeros((151, 2)), course])
         recording = Recording({"tip": measured[late]}, times=times[late], start=start)
-        found[name] = mg.identify(scene, {"height": Parameter(0.3, 0.1, 0.5, raised)}, [recording], onset=onset)
+        found[name] = mg.identify(scene, {"height": Parameter(0.3, 0.1, 0.5, raised)}, [recording], contact=contact)
     assert found["onset"].stopped is Stopped.CONVERGED
     np.testing.assert_allclose(found["onset"].values["height"], 0.25, atol=1e-6)
     assert found["discrete"].stopped is Stopped.STALLED
@@ -174,7 +175,7 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     whole = Recording({"qpos": turned, "qvel": course.qvel}, controls, noise=noise, start=start)
     windows = stack(scene, whole.cut(0.08, 0.01))
     assert windows.controls.shape == (3, 8, 1)
-    evaluate = jax.jit(jax.vmap(lambda w: residuals(scene, w, None, None, onset=None, gradient="discrete")[0]))
+    evaluate = jax.jit(jax.vmap(lambda w: residuals(scene, w, None, None, contact=mg.Discrete())[0]))
     found = np.array(evaluate(windows))[:, : 9 * 7].reshape(3, 9, 7)
     assert np.abs(found).max() < 1e-7
     whole_found = np.array(evaluate(stack(scene, [whole]))[0][: 31 * 7]).reshape(31, 7)

@@ -38,7 +38,7 @@ def _compared(scene, index, interval, horizon, speeds, count=96, read=3):
 
     def outcome(place):
         start = mg.initial_state(scene, scene.data.qpos.at[index].add(place), jnp.asarray(speeds))
-        course = mg.rollout(scene, start, horizon=horizon, engine="mujoco", gradient="slope")
+        course = mg.rollout(scene, start, horizon=horizon, contact=mg.Slope("mujoco"))
         return course.qpos[jnp.array([horizon // 2, horizon]), :read]
 
     parameters = phases(interval, count)
@@ -72,13 +72,11 @@ def test_the_motion_is_the_same_to_the_last_bit():
     scene = mg.load_scene(STICK)
     courses = [
         jax.jvp(
-            lambda v, g=gradient: (
-                mg.rollout(scene, mg.initial_state(scene, qvel=v), horizon=150, engine="mujoco", gradient=g).qpos
-            ),
+            lambda v, by=contact: mg.rollout(scene, mg.initial_state(scene, qvel=v), horizon=150, contact=by).qpos,
             (jnp.array([0.3, 0.0, 0.0]),),
             (jnp.ones(3),),
         )[0]
-        for gradient in ("discrete", "slope")
+        for contact in (mg.Discrete("mujoco"), mg.Slope("mujoco"))
     ]
     np.testing.assert_array_equal(*courses)
 
@@ -226,7 +224,7 @@ def test_a_cylinder_that_stands_on_a_box_has_the_slope_as_mean():
 
     def outcome(place):
         start = mg.initial_state(scene, qvel=jnp.array([0.05, 0.02 + place, 0, 0.03, 0.02, 0.01]))
-        return mg.rollout(scene, start, horizon=60, gradient="slope").qpos[-1, :2]
+        return mg.rollout(scene, start, horizon=60, contact=mg.Slope()).qpos[-1, :2]
 
     parameters = phases((-0.1, 0.1), 65)
     outcomes, derivatives = jax.jit(jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,))))(jnp.asarray(parameters))

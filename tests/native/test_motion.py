@@ -25,7 +25,7 @@ def test_the_motion_is_that_of_our_own_step(scene):
     random = np.random.default_rng(0)
     qvel, controls = random.normal(size=(6, scene.model.nv)), random.normal(size=(6, HORIZON, scene.model.nu))
     ours, theirs = (
-        jax.jit(jax.vmap(lambda v, u, engine=engine: _rollout(scene, v, u, engine=engine)))(qvel, controls)
+        jax.jit(jax.vmap(lambda v, u, by=mg.Discrete(engine): _rollout(scene, v, u, contact=by)))(qvel, controls)
         for engine in ("mjx", "mujoco")
     )
     # Both solve to the file's tolerance, which impacts amplify.
@@ -47,7 +47,9 @@ def test_starts_and_softness_may_be_mapped_over_at_once():
     def last(stiffness, speed):
         soft = scene.with_softness(mg.Softness(stiffness=stiffness, damping_ratio=1.0))
         qvel = jnp.zeros(scene.model.nv).at[2].set(speed)
-        return mg.rollout(soft, mg.initial_state(soft, qvel=qvel), horizon=HORIZON, engine="mujoco").qpos[-1]
+        return mg.rollout(soft, mg.initial_state(soft, qvel=qvel), horizon=HORIZON, contact=mg.Discrete("mujoco")).qpos[
+            -1
+        ]
 
     found = jax.jit(jax.vmap(jax.vmap(last, (None, 0)), (0, None)))(stiffness, speeds)
     expected = np.array([[last(k, v) for v in speeds] for k in stiffness])
@@ -57,7 +59,9 @@ def test_starts_and_softness_may_be_mapped_over_at_once():
 
 def test_a_rollout_that_diverges_stays_at_its_last_good_state(scene):
     controls = jnp.zeros((HORIZON, scene.model.nu)).at[7, 0].set(jnp.nan)
-    trajectory = jax.jit(lambda u: _rollout(scene, jnp.zeros(scene.model.nv), u, engine="mujoco"))(controls)
+    trajectory = jax.jit(lambda u: _rollout(scene, jnp.zeros(scene.model.nv), u, contact=mg.Discrete("mujoco")))(
+        controls
+    )
     assert trajectory.diverged
     assert trajectory.first_bad_step == 7
     assert np.isfinite(trajectory.qpos).all()
@@ -69,16 +73,22 @@ def test_zeroth_order_is_the_same_by_either_engine(scene):
     controls = jnp.zeros(HORIZON * scene.model.nu)
     costs = [
         mg.estimators.zeroth_order(
-            mg.open_loop(task.with_engine(engine), 0.1), controls, jax.random.key(0), num_samples=4
+            mg.open_loop(task.with_contact(mg.Discrete(engine)), 0.1), controls, jax.random.key(0), num_samples=4
         )
         for engine in ("mjx", "mujoco")
     ]
     np.testing.assert_allclose(costs[1].value, costs[0].value, atol=1e-6 * np.abs(costs[0].value).max())
 
 
-def test_an_onset_is_refused(scene):
-    with pytest.raises(ValueError, match="MuJoCo's own motion, got onset: leave it out"):
-        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, engine="mujoco", onset=mg.Onset())
+def test_observations_are_refused(scene):
+    how = {"horizon": 2, "contact": mg.Discrete("mujoco"), "observe": lambda model, data: data.qpos}
+    with pytest.raises(ValueError, match="observe must be left out where C MuJoCo steps"):
+        _rollout(scene, jnp.zeros(scene.model.nv), None, **how)
+
+
+def test_an_engine_that_is_none_is_refused():
+    with pytest.raises(ValueError, match='engine must be "mjx", "mujoco" or None, got \'warp\''):
+        mg.Discrete("warp")
 
 
 def test_a_policy_is_asked_before_each_step(scene):
@@ -88,8 +98,8 @@ def test_a_policy_is_asked_before_each_step(scene):
         return -gain * state.qvel[: scene.model.nu] + 0.3 * jnp.sin(30 * state.time)
 
     start = mg.initial_state(scene, qvel=0.1 * jnp.arange(scene.model.nv))
-    closed = mg.rollout(scene, start, policy, 0.5, horizon=HORIZON, engine="mujoco")
-    again = mg.rollout(scene, start, closed.ctrl, engine="mujoco")
+    closed = mg.rollout(scene, start, policy, 0.5, horizon=HORIZON, contact=mg.Discrete("mujoco"))
+    again = mg.rollout(scene, start, closed.ctrl, contact=mg.Discrete("mujoco"))
     # A solve that starts from another acceleration ends within its tolerance, not at the same bit.
     np.testing.assert_allclose(closed.qpos, again.qpos, atol=1e-7)
     assert np.ptp(closed.ctrl) > 0.1
@@ -110,11 +120,11 @@ def test_what_is_given_to_each_step_acts_alike_in_both_engines():
         "eq_active": (time < HORIZON // 2).astype(np.uint8),
     }
     ours, theirs = (
-        mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, inputs=inputs, engine=engine).qpos
+        mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, inputs=inputs, contact=mg.Discrete(engine)).qpos
         for engine in ("mjx", "mujoco")
     )
     np.testing.assert_allclose(theirs, ours, atol=1e-7)  # what the solves leave, and contacts multiply
-    still = mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, engine="mujoco").qpos
+    still = mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, contact=mg.Discrete("mujoco")).qpos
     assert np.abs(still - theirs).max() > 1e-2
 
 

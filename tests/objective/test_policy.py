@@ -1,5 +1,6 @@
-"""Linear and tanh policies."""
+"""Linear policies, and networks of equinox in their place."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +12,6 @@ from mjxgrad.rollouts import State
 from tests.estimators import textbook
 
 STATE = jnp.array([0.7, -0.4])
-
-
-def mlp(key, **settings):
-    return mg.mlp_policy(2, 1, **{"width": 5, "depth": 2, **settings}, key=key)
 
 
 def test_a_linear_policy_is_a_gain_and_an_offset():
@@ -31,30 +28,6 @@ def test_without_bias_only_the_gain_is_a_parameter():
     np.testing.assert_allclose(policy(Affine(jnp.ones((3, 2)), None), STATE), 0.3 * np.ones(3), rtol=1e-6)
 
 
-def test_a_perceptron_is_its_formula(key):
-    policy, params = mlp(key)
-    assert [layer.gain.shape for layer in params] == [(5, 2), (5, 5), (1, 5)]
-    # Offsets start as zero and would not be seen.
-    first, second, last = (Affine(layer.gain, layer.offset + 0.3) for layer in params)
-    hidden = np.tanh(second.gain @ np.tanh(first.gain @ STATE + 0.3) + 0.3)
-    np.testing.assert_allclose(policy((first, second, last), STATE), last.gain @ hidden + 0.3, rtol=1e-12)
-
-
-def test_a_perceptron_starts_with_small_actions_that_are_not_zero(key):
-    """An action is a sum of `width` terms 0.01 h/√width with |h| < 1: its standard deviation is below 0.01."""
-    policy, params = mg.mlp_policy(2, 200, width=64, depth=2, key=key)
-    actions = np.asarray(policy(params, 3 * STATE))
-    assert 1e-3 < actions.std() < 0.01
-
-
-@pytest.mark.parametrize("width", [1, 3, 64])
-def test_hidden_signals_keep_their_size_at_any_width(width):
-    """Gains have variance 1/inputs: a state of unit components gives the first layer unit variance."""
-    draw = jax.vmap(lambda key: mg.mlp_policy(4, 1, width=width, depth=1, key=key)[1][0](jnp.ones(4)))
-    before_tanh = draw(jax.random.split(jax.random.key(0), 1000))
-    np.testing.assert_allclose((before_tanh**2).mean(), 1.0, rtol=4 * np.sqrt(2 / 1000))
-
-
 def test_of_a_scene_s_state_positions_velocities_and_activations_are_observed():
     state = State(jnp.array([1.0, 2.0]), jnp.array([3.0]), jnp.array([4.0]), jnp.array(9.0), jnp.array([8.0]))
     policy, _ = mg.linear_policy(4, 4)
@@ -68,7 +41,9 @@ def test_what_is_observed_can_be_chosen():
 
 @pytest.mark.parametrize("kind", ["linear", "mlp"])
 def test_a_policy_closes_a_loop_and_is_differentiated_by_its_noise(kind, key):
-    policy, params = mg.linear_policy(2, 1) if kind == "linear" else mlp(key)
+    policy, params = mg.linear_policy(2, 1)
+    if kind == "mlp":
+        policy, params = lambda net, state: net(state), eqx.nn.MLP(2, 1, 5, 2, activation=jnp.tanh, key=key)
     objective = mg.closed_loop(textbook.LinearSystem(), policy, 0.3, params=params)
     flat, noise = objective.ravel(params) + 0.1, objective.sample_noise(key)
 
@@ -103,23 +78,6 @@ def test_a_state_that_is_neither_vector_nor_scene_is_refused():
         policy(params, {"x": STATE})
 
 
-def test_sizes_are_positive(key):
-    with pytest.raises(ValueError, match="width must be at least 1, got 0"):
-        mlp(key, width=0)
+def test_sizes_are_positive():
     with pytest.raises(ValueError, match="num_controls must be at least 1, got 0"):
         mg.linear_policy(3, 0)
-
-
-def test_a_perceptron_with_limits_stays_within_them_and_moves_freely_in_the_middle(key):
-    """M + l tanh(y/l): the middle for y = 0 with slope 1, an end for y far away; no bound where a limit is infinite."""
-    limits = jnp.array([[-1.0, 3.0], [-jnp.inf, jnp.inf]])
-    policy, (hidden, last) = mg.mlp_policy(1, 2, width=1, depth=1, key=key, limits=limits)
-
-    def act(offset):
-        return policy((hidden, Affine(0 * last.gain, offset * jnp.ones(2))), jnp.ones(1))
-
-    np.testing.assert_allclose(act(0.0), [1.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(act)(0.0), [1.0, 1.0], rtol=1e-12)
-    np.testing.assert_allclose([act(-100.0), act(100.0)], [[-1.0, -100.0], [3.0, 100.0]], rtol=1e-12)
-    with pytest.raises(ValueError, match=r"limits must have shape \(2, 2\)"):
-        mg.mlp_policy(1, 2, width=1, depth=1, key=key, limits=limits[:1])

@@ -12,7 +12,7 @@ import mjxgrad as mg
 from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.planning.linear_model import Analytic, Exact, Sampled
 from mjxgrad.planning.system import FunctionSystem, SceneSystem
-from mjxgrad.stepping import Smoothing
+from mjxgrad.stepping import Smoothing, own_motion
 
 A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
 POINT, CONTROL, STDDEV = 0.03, jnp.zeros(1), 0.05
@@ -206,7 +206,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(key, settings, sentence):
 
 def test_a_system_without_contacts_refuses_analytic_smoothing():
     with pytest.raises(ValueError, match="analytic smoothing must be of a SceneSystem, got FunctionSystem"):
-        FunctionSystem(affine, 2, 1).with_smoothing(Smoothing(0.1))
+        FunctionSystem(affine, 2, 1).with_contact(Smoothing(0.1))
 
 
 SPRING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
@@ -221,7 +221,7 @@ def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
     rate = np.array([-h * k, m]) / (m + h * c)
     one_a = np.array([[1 + h * rate[0], h * rate[1]], rate])
     one_b = np.array([[h], [1]]) * h / (m + h * c)
-    system = SceneSystem(mg.load_scene(SPRING), num_substeps=2, gradient=gradient)
+    system = SceneSystem(mg.load_scene(SPRING), num_substeps=2, contact=own_motion(gradient))
     at, control, noise = jnp.array([0.1, -0.3]), jnp.array([0.7]), {"stddev_state": 0.1, "stddev_control": 0.1}
 
     @eqx.filter_jit
@@ -316,7 +316,7 @@ def test_through_a_bounce_mean_jacobians_agree_with_least_squares_only_with_even
 
     @eqx.filter_jit
     def model(estimate, gradient):
-        return estimate(SceneSystem(scene, 120, gradient=gradient), at, CONTROL, key, **noise)
+        return estimate(SceneSystem(scene, 120, own_motion(gradient)), at, CONTROL, key, **noise)
 
     truth = model(zeroth_order, "discrete")
     right, wrong = model(first_order, "slope"), model(first_order, "discrete")

@@ -220,7 +220,9 @@ def test_to_plan_again_compiles_nothing(compilations):
         )
         given = shifted(plan)
         state = SceneSystem(scene, num_substeps=2).step(jnp.array([0.1 * i, 0.0]), jnp.ones(1))
-        mg.rollout(scene, mg.initial_state(scene, state[:1], state[1:]), float(i) * jnp.ones((3, 1)), onset=mg.Onset())
+        mg.rollout(
+            scene, mg.initial_state(scene, state[:1], state[1:]), float(i) * jnp.ones((3, 1)), contact=mg.Onset()
+        )
         assert i == 0 or len(compilations) == before
 
 

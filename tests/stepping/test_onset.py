@@ -19,7 +19,7 @@ from mjxgrad.tasks import wall_softness
 from tests.scenes import ASSETS
 
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
-_ONSETS = {"continuous": mg.Onset(), "mujoco": None}
+_ONSETS = {"continuous": mg.Onset(), "mujoco": mg.Discrete()}
 # Sub-intervals of one look, how many of them are looked at again, and how often each: 64⁷ is 4·10¹².
 _PARTS, _FOLLOWED, _LOOKS = 64, 3, 7
 
@@ -34,7 +34,7 @@ def _end(scene, start, num_steps, kind):
     """Return position and velocity after some steps."""
 
     def step(_, state):
-        moved = mg.step(scene.model, start.replace(**dict(zip(_STATE, state, strict=True))), onset=_ONSETS[kind])
+        moved = mg.step(scene.model, start.replace(**dict(zip(_STATE, state, strict=True))), contact=_ONSETS[kind])
         return tuple(getattr(moved, field) for field in _STATE)
 
     state = jax.lax.fori_loop(0, num_steps, step, tuple(getattr(start, field) for field in _STATE))
@@ -188,7 +188,7 @@ def test_forward_and_reverse_mode_agree():
 
     def cost(height):
         start = mg.initial_state(scene, jnp.asarray(qpos).at[2].set(height), qvel)
-        final = mg.rollout(scene, start, horizon=45, onset=mg.Onset()).final
+        final = mg.rollout(scene, start, horizon=45, contact=mg.Onset()).final
         return jnp.arange(1.0, 8.0) @ final.qpos + jnp.arange(1.0, 7.0) @ final.qvel
 
     heights = jnp.linspace(0.1, 0.11, 16)
@@ -224,7 +224,7 @@ def test_the_impulse_of_a_contact_grows_in_proportion_to_the_time_that_is_left(c
 
     def after(distance):
         start = scene.data.replace(qpos=scene.data.qpos.at[2].set(5 + distance), qvel=qvel)
-        return mg.step(scene.model, start, onset=mg.Onset(0.0)).qvel - qvel
+        return mg.step(scene.model, start, contact=mg.Onset(0.0)).qvel - qvel
 
     shares = np.linspace(0.05, 0.95, 7)
     change = jax.jit(jax.vmap(after))(jnp.asarray((0.5 - shares) * h * speed))
@@ -238,12 +238,12 @@ def test_free_flight_and_deep_contact_are_mujocos():
     qvel = jnp.array([0.3, 0.0, -0.2, 0.0, 1.0, 0.0])
     starts = 5 + jnp.array([0.3, 0.01, -0.005, -0.01])
 
-    def after(height, onset):
+    def after(height, contact):
         start = scene.data.replace(qpos=scene.data.qpos.at[2].set(height), qvel=qvel)
-        return mg.step(scene.model, start, onset=onset).qvel
+        return mg.step(scene.model, start, contact=contact).qvel
 
     for onset in (mg.Onset(), mg.Onset(0.0)):
-        both = [jax.jit(jax.vmap(lambda z, o=o: after(z, o)))(starts) for o in (onset, None)]
+        both = [jax.jit(jax.vmap(lambda z, o=o: after(z, o)))(starts) for o in (onset, mg.Discrete())]
         np.testing.assert_allclose(*both, rtol=0, atol=1e-15)  # two programs, whose sums XLA may order otherwise
 
 
@@ -342,7 +342,7 @@ def test_a_throw_through_the_softened_wall_has_no_teeth():
         place = np.linspace(-1, 1, len(values))
         return (values - np.polyval(np.polyfit(place, values, 5), place)).std()
 
-    assert roughness(costs(task.with_onset(mg.Onset()))) < 0.05 * roughness(costs(task))
+    assert roughness(costs(task.with_contact(mg.Onset()))) < 0.05 * roughness(costs(task))
 
 
 _PUSHED = """
@@ -370,7 +370,7 @@ def test_a_thing_pushed_along_the_floor_keeps_a_derivative_of_a_size_to_be_belie
     def speed(force):
         start = mg.initial_state(scene)
         controls = force * jnp.ones((round(0.24 / timestep), 1))
-        return mg.rollout(scene, start, controls, onset=mg.Onset()).qvel[-1, 1]
+        return mg.rollout(scene, start, controls, contact=mg.Onset()).qvel[-1, 1]
 
     derivatives = jax.jit(jax.vmap(jax.grad(speed)))(jnp.linspace(0.7, 0.98, 64))
     # The slope of the outcome is 0.7 to 1.1 (m/s per unit of control).
@@ -402,16 +402,16 @@ def test_a_light_foot_that_a_strong_motor_presses_down_does_not_chatter():
     scene = mg.load_scene(_FOOT)
     time = 4e-3 * jnp.arange(75)
 
-    def turning(place, onset):
+    def turning(place, contact):
         controls = 0.6 * jnp.sin(2 * jnp.pi * 6 * time + place)
         start = mg.initial_state(
             scene, qpos=jnp.stack([-0.06, 0.0, 0.05 + 0.1 * place]), qvel=jnp.array([-0.6, 0.1, 0])
         )
-        return mg.rollout(scene, start, controls[:, None], onset=onset).qvel[-1, 2]
+        return mg.rollout(scene, start, controls[:, None], contact=contact).qvel[-1, 2]
 
     places = jnp.linspace(-1, 1, 128)
     values, derivatives = jax.jit(jax.vmap(jax.value_and_grad(lambda x: turning(x, mg.Onset()))))(places)
-    mujocos = jax.jit(jax.vmap(lambda x: turning(x, None)))(places)
+    mujocos = jax.jit(jax.vmap(lambda x: turning(x, mg.Discrete())))(places)
     slope = (values[-1] - values[0]) / 2
     assert np.abs(derivatives).max() < 15 * np.abs(slope)
     assert np.abs(derivatives.mean() - slope) < 3 * derivatives.std() / np.sqrt(128)
@@ -441,7 +441,7 @@ def test_the_width_can_be_swept_and_differentiated():
     start = scene.data.replace(qpos=scene.data.qpos.at[2].set(5.00001), qvel=jnp.array([0.0, 0, -1e-3, 0, 0, 0]))
 
     def after(width):
-        return mg.step(scene.model, start, onset=mg.Onset(width)).qvel[2]
+        return mg.step(scene.model, start, contact=mg.Onset(width)).qvel[2]
 
     widths = jnp.array([0.05, 0.1, 0.4])
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(after)))(widths)
@@ -457,36 +457,10 @@ def test_a_width_without_meaning_is_refused(width):
         mg.Onset(width)
 
 
-def test_the_event_gradient_is_refused_beside_an_onset():
+def test_a_batch_of_widths_is_refused():
     scene = _scene(_BALL.format(cone="pyramidal", condim=3))
-    with pytest.raises(ValueError, match="gradient must be 'discrete' with an onset"):
-        mg.step(scene.model, scene.data, gradient="slope", onset=mg.Onset())
-    with pytest.raises(ValueError, match=r"sweep under jax\.vmap"):
-        mg.step(scene.model, scene.data, onset=mg.Onset(jnp.ones(3)))
-
-
-@pytest.mark.slow
-def test_smoothing_of_contacts_leaves_the_onset_to_the_limits():
-    """Noise on the distance already makes contact continuous; a joint limit has none."""
-    both = """
-    <mujoco>
-      <option timestep="0.002" gravity="0 0 0"/>
-      <worldbody>
-        <geom type="plane" size="5 5 .1"/>
-        <body pos="0 0 .05"><joint type="slide" axis="0 0 1"/><geom size=".05"/></body>
-        <body pos="1 0 .5"><joint type="slide" axis="0 0 1" range="-.1 1" limited="true"/><geom size=".05"/></body>
-      </worldbody>
-    </mujoco>
-    """
-    scene = _scene(both)
-    start = scene.data.replace(qpos=jnp.array([0.0004, -0.0996]), qvel=jnp.array([-1.0, -1.0]))
-    smoothing = mg.Smoothing(1e-3)
-    plain, soft, whole = (
-        jax.jit(functools.partial(mg.step, onset=onset, smoothing=s))(scene.model, start).qvel
-        for onset, s in ((mg.Onset(), None), (None, smoothing), (mg.Onset(), smoothing))
-    )
-    np.testing.assert_allclose(whole, [soft[0], plain[1]], rtol=1e-12)
-    assert plain[1] > soft[1] + 1e-3  # without an onset the limit does not act yet
+    with pytest.raises(ValueError, match=r"width must be one value .* sweep under jax\.vmap"):
+        mg.step(scene.model, scene.data, contact=mg.Onset(jnp.ones(3)))
 
 
 _BALL_ON_BOX = """

@@ -1,4 +1,4 @@
-"""`gradient="slope"` of MJX's step: MuJoCo's motion to the bit, and the derivative whose mean is the slope of its outcome."""
+"""`mg.Slope` of MJX's step: MuJoCo's motion to the bit, and the derivative whose mean is the slope of its outcome."""
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,10 @@ BALL = """<mujoco><option gravity="0 0 0" timestep="0.002"/><worldbody><geom typ
     <joint type="slide" axis="0 0 1" {limit}/><geom size=".1" mass="1" {contact}/></body></worldbody></mujoco>"""
 
 
-def _ends(scene, gradient):
+def _ends(scene, contact):
     def end(place):
         start = mg.initial_state(scene, place[None], jnp.array([-2.0]))
-        return mg.rollout(scene, start, horizon=120, gradient=gradient, engine="mjx").qpos[-1, 0]
+        return mg.rollout(scene, start, horizon=120, contact=contact).qpos[-1, 0]
 
     places = phases((0.0, 0.03), 96)
     outcomes, derivatives = jax.jit(jax.vmap(jax.value_and_grad(end)))(jnp.asarray(places))
@@ -30,8 +30,8 @@ def _ends(scene, gradient):
 def test_the_mean_derivative_of_a_bounce_is_its_slope_and_the_motion_is_mujocos(limit, contact):
     """-e⁻², nearly: contact at the critical damping leaves e⁻² of the speed."""
     scene = mg.load_scene(BALL.format(limit=limit, contact=contact))
-    places, outcomes, derivatives = _ends(scene, "slope")
-    _, own, discrete = _ends(scene, "discrete")
+    places, outcomes, derivatives = _ends(scene, mg.Slope("mjx"))
+    _, own, discrete = _ends(scene, mg.Discrete("mjx"))
     np.testing.assert_array_equal(outcomes, own)
     found = compare_to_slope(places, outcomes, [derivatives, discrete], ("slope", "discrete"))
     np.testing.assert_allclose(found.mean[0], found.slope, atol=0.02)

@@ -20,40 +20,40 @@ SCENE = f"""<mujoco><option timestep="0.004" cone="{{cone}}" tolerance="1e-14"/>
 HORIZON = 12
 
 
-def _rolled(scene, onset):
+def _rolled(scene, contact):
     velocity = jnp.asarray(np.random.default_rng(2).normal(scale=0.3, size=scene.model.nv))
 
     def last(velocity):
-        trajectory = mg.rollout(scene, mg.initial_state(scene, qvel=velocity), horizon=HORIZON, onset=onset)
+        trajectory = mg.rollout(scene, mg.initial_state(scene, qvel=velocity), horizon=HORIZON, contact=contact)
         return jnp.sin(trajectory.qpos[-1]).sum(), trajectory
 
     return jax.jit(jax.value_and_grad(last, has_aux=True))(velocity)
 
 
 @pytest.mark.parametrize(
-    ("cone", "onset"),
-    [("pyramidal", mg.Onset()), pytest.param("elliptic", None, marks=pytest.mark.slow)],
+    ("cone", "contact"),
+    [("pyramidal", mg.Onset()), pytest.param("elliptic", mg.Discrete(), marks=pytest.mark.slow)],
     ids=["onset", "elliptic"],
 )
-def test_room_for_those_that_touch_changes_neither_motion_nor_derivative(cone, onset):
+def test_room_for_those_that_touch_changes_neither_motion_nor_derivative(cone, contact):
     """Three act, and the fourth that could is over a metre away."""
     scenes = [mg.load_scene(SCENE.format(cone=cone), max_contacts=room) for room in (None, 4)]
     rows = [scene.data._impl.efc_J.shape[0] for scene in scenes]
     assert rows[1] < rows[0]
-    ((_, all_of_them), gradient), ((_, nearest), other) = (_rolled(scene, onset) for scene in scenes)
+    ((_, all_of_them), gradient), ((_, nearest), other) = (_rolled(scene, contact) for scene in scenes)
     # Sums in another order, over twelve steps of impacts.
     np.testing.assert_allclose(nearest.qpos, all_of_them.qpos, atol=1e-12)
     np.testing.assert_allclose(other, gradient, atol=1e-12 * np.abs(gradient).max())
     assert nearest.crowded == all_of_them.crowded == 0
 
 
-@pytest.mark.parametrize("onset", [None, mg.Onset()], ids=["MuJoCo's", "onset"])
-def test_more_contacts_than_room_are_counted_in_every_step(onset):
+@pytest.mark.parametrize("contact", [mg.Discrete(), mg.Onset()], ids=["MuJoCo's", "onset"])
+def test_more_contacts_than_room_are_counted_in_every_step(contact):
     """A box at rest stands on four corners."""
     box = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .0999"><freejoint/>
         <geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
     scene = mg.load_scene(box, max_contacts=2)
-    trajectory = jax.jit(lambda: mg.rollout(scene, mg.initial_state(scene), horizon=3, onset=onset))()
+    trajectory = jax.jit(lambda: mg.rollout(scene, mg.initial_state(scene), horizon=3, contact=contact))()
     assert trajectory.crowded == 3
 
 

@@ -14,7 +14,7 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import SceneWarning
 from mjxgrad.solver.kernels import KERNELS
-from mjxgrad.stepping import smoothing_warnings
+from mjxgrad.stepping import check_contact, own_motion, smoothing_warnings
 from tests.solver.test_kernels import DISTRIBUTIONS
 from tests.solver.test_smoothed_law import _nodes
 
@@ -38,15 +38,15 @@ def _scene(cone="pyramidal", dim=1):
 
 
 @eqx.filter_jit
-def _acceleration(model, data, position, velocity, smoothing):
-    moved = mg.forward(model, data.replace(qpos=position, qvel=velocity), smoothing=smoothing)
+def _acceleration(model, data, position, velocity, contact):
+    moved = mg.forward(model, data.replace(qpos=position, qvel=velocity), contact=contact)
     return moved.qacc
 
 
-def _at(height, sink=SINK, slide=0.0, limit=0.0, smoothing=None, **scene):
+def _at(height, sink=SINK, slide=0.0, limit=0.0, contact=mg.Discrete(), **scene):
     model, data = _scene(**scene)
     position, velocity = jnp.array([height, 0.0, limit]), jnp.array([sink, slide, 0.0])
-    return np.asarray(_acceleration(model, data, position, velocity, smoothing))
+    return np.asarray(_acceleration(model, data, position, velocity, contact))
 
 
 # Other laws than the plain Gaussian's compile for a while; what is theirs, `test_law` tests apart from the step.
@@ -83,7 +83,7 @@ def test_acceleration_balances_the_mean_force_under_noise(name):
         return 2 * (a + 9.81) + weight * np.sum(share * push)
 
     exact = optimize.brentq(excess, -20, 100, xtol=1e-13)
-    found = _at(HEIGHT, smoothing=mg.Smoothing(LENGTH, name))[0]
+    found = _at(HEIGHT, contact=mg.Smoothing(LENGTH, name))[0]
     assert found == pytest.approx(exact, rel=1e-8)
     assert found > -9.0  # it is not the fall
 
@@ -93,23 +93,23 @@ def test_without_length_it_is_the_step_of_mujoco(scene):
     """Noise of a tenth of a micrometre; the impedance's slope times that depth, 1e-7 / 4e-3 of the force, and less."""
     small = mg.Smoothing(1e-7)
     for height in (-1e-3, 1e-3, 0.3):
-        found, hard = (_at(height, slide=0.4, smoothing=s, **scene) for s in (small, None))
+        found, hard = (_at(height, slide=0.4, contact=s, **scene) for s in (small, mg.Discrete()))
         np.testing.assert_allclose(found, hard, rtol=1e-4, atol=1e-6)
 
 
 def test_without_the_gate_an_approaching_body_is_braked_from_afar():
     """At 1 m/s a row without gate acts from 2 ζ |v| / ω = 40 mm (dw B / (d K)) on; with it, from a few lengths."""
     far = 0.02
-    assert _at(far, -1.0, smoothing=mg.Smoothing(LENGTH))[0] == pytest.approx(-9.81, abs=1e-9)
-    assert _at(far, -1.0, smoothing=mg.Smoothing(LENGTH, gated=False))[0] > 5.0
+    assert _at(far, -1.0, contact=mg.Smoothing(LENGTH))[0] == pytest.approx(-9.81, abs=1e-9)
+    assert _at(far, -1.0, contact=mg.Smoothing(LENGTH, gated=False))[0] > 5.0
 
 
 def test_limits_are_smoothed_by_a_length_of_their_own():
     """A slider at rest 1 mm before its limit is pushed back if limits are smoothed, and only then."""
     contacts, both = mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, limit_length=LENGTH)
-    assert _at(1.0, limit=0.099, smoothing=contacts)[2] == 0
-    assert _at(1.0, limit=0.099, smoothing=both)[2] < -0.1
-    assert _at(1.0, limit=0.0, smoothing=both)[2] == pytest.approx(0, abs=1e-9)
+    assert _at(1.0, limit=0.099, contact=contacts)[2] == 0
+    assert _at(1.0, limit=0.099, contact=both)[2] < -0.1
+    assert _at(1.0, limit=0.0, contact=both)[2] == pytest.approx(0, abs=1e-9)
 
 
 @scenes
@@ -119,7 +119,7 @@ def test_derivatives_are_central_differences(scene):
 
     def outcome(p):
         position, velocity = jnp.array([p[0], 0.0, 0.0]), jnp.array([p[1], p[2], 0.0])
-        moved = mg.step(model, data.replace(qpos=position, qvel=velocity), smoothing=mg.Smoothing(p[3]))
+        moved = mg.step(model, data.replace(qpos=position, qvel=velocity), contact=mg.Smoothing(p[3]))
         return jnp.dot(moved.qvel, jnp.array([1.0, 0.7, 0.0]))
 
     point = jnp.array([HEIGHT, SINK, 0.3, LENGTH])
@@ -136,18 +136,18 @@ def test_derivatives_are_central_differences(scene):
 def test_backward_moves_as_without_and_differentiates_the_smoothed_step(scene):
     """To the last bit the one, and to that of the solve the other: two starts of one iteration."""
     model, data = _scene(**scene)
-    modes = (None, mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, mode="backward"))
+    modes = (mg.Discrete(), mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, mode="backward"))
 
-    def outcome(height, smoothing):
+    def outcome(height, contact):
         position = jnp.array([0.0, 0.0, 0.0]).at[0].set(height)
         start = data.replace(qpos=position, qvel=jnp.array([SINK, 0.3, 0.0]))
-        moved = mg.step(model, start, smoothing=smoothing)
+        moved = mg.step(model, start, contact=contact)
         return moved.qvel, moved.qfrc_constraint, moved._impl.efc_force
 
     @jax.jit
     def program(height):
         one = jnp.ones_like(height)
-        return [jax.jvp(functools.partial(outcome, smoothing=s), (height,), (one,)) for s in modes]
+        return [jax.jvp(functools.partial(outcome, contact=s), (height,), (one,)) for s in modes]
 
     for height in (HEIGHT, -HEIGHT):
         (hard, hard_slope), (_, smooth_slope), (backward, slope) = program(jnp.array(height))
@@ -164,7 +164,7 @@ def test_runge_kutta_takes_the_smoothed_acceleration_at_each_stage():
     start = np.array([HEIGHT, 0.0, 0.0]), np.array([SINK, 0.3, 0.0])
     smoothing, h = mg.Smoothing(LENGTH), 2e-3
     rungs = model.tree_replace({"opt.integrator": mjx.IntegratorType.RK4})
-    moved = eqx.filter_jit(mg.step)(rungs, data.replace(qpos=start[0], qvel=start[1]), smoothing=smoothing)
+    moved = eqx.filter_jit(mg.step)(rungs, data.replace(qpos=start[0], qvel=start[1]), contact=smoothing)
     rates, position, velocity = [], *start
     for share in (0.5, 0.5, 1.0, None):
         rates.append((velocity, np.asarray(_acceleration(model, data, position, velocity, smoothing))))
@@ -180,7 +180,7 @@ def test_lengths_are_swept_in_one_program():
     model, data = _scene()
     lengths = jnp.array([1e-3, 3e-3])
     sweep = jax.vmap(lambda s: _acceleration(model, data, jnp.array([HEIGHT, 0, 0]), jnp.array([SINK, 0, 0]), s))
-    each = [_at(HEIGHT, smoothing=mg.Smoothing(length)) for length in lengths]
+    each = [_at(HEIGHT, contact=mg.Smoothing(length)) for length in lengths]
     np.testing.assert_allclose(sweep(mg.Smoothing(lengths)), each, rtol=1e-10)
 
 
@@ -194,7 +194,7 @@ def test_a_capsule_over_a_box_has_no_force_at_a_distance_and_the_warning_says_so
     """MJX says 1 m of 5 mm, within reach of the log barrier; the fall stays a fall."""
     model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX))
     smoothing = mg.Smoothing(5e-3, "log_barrier")
-    moved = eqx.filter_jit(mg.forward)(model, mjx.make_data(model), smoothing=smoothing)
+    moved = eqx.filter_jit(mg.forward)(model, mjx.make_data(model), contact=smoothing)
     np.testing.assert_allclose(moved.qacc, [-9.81], atol=1e-12)
     assert "pin – box" in smoothing_warnings(smoothing, model)[0]
 
@@ -204,7 +204,7 @@ def test_a_ball_over_a_box_has_force_at_a_distance_and_no_warning():
     model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX.replace('type="capsule" size=".1 .05"', 'size=".1"')))
     smoothing = mg.Smoothing(5e-3, "log_barrier")
     assert not smoothing_warnings(smoothing, model)
-    forward = jax.jit(lambda data: mg.forward(model, data, smoothing=smoothing))
+    forward = jax.jit(lambda data: mg.forward(model, data, contact=smoothing))
     assert forward(mjx.make_data(model)).qacc[0] > -9.81 + 1
 
 
@@ -215,7 +215,7 @@ def test_a_scene_without_contact_or_limits_is_named():
     )
     with pytest.warns(SceneWarning, match="logistic contact has no effect"):
         jax.eval_shape(
-            lambda s: mg.rollout(scene, s, horizon=2, smoothing=mg.Smoothing(1e-3, "logistic")), mg.initial_state(scene)
+            lambda s: mg.rollout(scene, s, horizon=2, contact=mg.Smoothing(1e-3, "logistic")), mg.initial_state(scene)
         )
     assert "limit_length has no effect" in smoothing_warnings(mg.Smoothing(1.0, limit_length=0.1), scene.model)[1]
 
@@ -241,7 +241,13 @@ def test_what_has_no_meaning_is_refused(settings, message):
 
 
 def test_what_a_step_cannot_take_is_refused():
-    """A batch of lengths, and two corrections of one event."""
+    """A batch of lengths, C MuJoCo within MJX's step, and names."""
     model, data = _scene()
     with pytest.raises(ValueError, match="length must be one value for a step, got shape \\(2,\\)"):
-        mg.step(model, data, smoothing=mg.Smoothing([1e-3, 2e-3]))
+        mg.step(model, data, contact=mg.Smoothing([1e-3, 2e-3]))
+    with pytest.raises(ValueError, match=r'engine None or "mjx" in a step of MJX, got "mujoco": use mg\.rollout'):
+        mg.step(model, data, contact=mg.Slope("mujoco"))
+    with pytest.raises(ValueError, match=r"mg\.Slope\(\), mg\.Onset\(\) or mg\.Smoothing\(\), got \"slope\""):
+        check_contact("slope")
+    with pytest.raises(ValueError, match="gradient must be one of 'discrete', 'slope', got 'event'"):
+        own_motion("event")

@@ -30,10 +30,13 @@ CART = """
 @pytest.fixture(scope="session")
 def ends():
     """Where the ball ends, by stiffness; one compilation for both."""
-    task = ball_wall().with_gradient("discrete")  # MuJoCo's motion
-    throw = jax.jit(
-        jax.vmap(lambda softness, angle: task.with_softness(softness).trajectory(angle).qpos[-1, 0], in_axes=(None, 0))
-    )
+    task = ball_wall()
+
+    @jax.jit
+    def throw(softness, angles):
+        scene = task.scene.with_softness(softness)
+        return jax.vmap(lambda angle: rollout(scene, task.start(angle), horizon=task.horizon).qpos[-1, 0])(angles)
+
     return {k: np.asarray(throw(wall_softness(k), jnp.asarray(ANGLES)[:, None])) for k in (SOFT, STIFF)}
 
 

@@ -1,0 +1,95 @@
+"""How contact is stepped: one record for the motion and for its derivative.
+
+| record | motion | derivative |
+|---|---|---|
+| `Discrete` | MuJoCo's own | each step's own, equal to its finite differences |
+| `Slope` | MuJoCo's own | one whose mean is the slope of the outcome |
+| `Onset` | continuous, near MuJoCo's | the motion's own, which is the slope |
+| `Smoothing` | averaged over noise, or MuJoCo's own | the averaged motion's |
+
+All are pytrees. Lengths and widths are leaves, so a sweep over them is one `jax.vmap`.
+"""
+
+import dataclasses
+from typing import Any, ClassVar, Literal, get_args
+
+import equinox as eqx
+import jax
+
+from mjxgrad.stepping.onset import Onset
+from mjxgrad.stepping.smoothing import Smoothing
+
+Engine = Literal["mjx", "mujoco"]
+Gradient = Literal["discrete", "slope"]
+"""Names of the derivatives along MuJoCo's own motion, for command lines and files; see `own_motion`."""
+
+
+class OwnMotion(eqx.Module):
+    """MuJoCo's own motion, to the bit: the common part of `Discrete` and `Slope`.
+
+    Attributes:
+        engine: "mjx"; or "mujoco", C MuJoCo on all cores of the processor, without compilation, differentiable once. The
+            motions agree to the solver's tolerance. None is the scene's own, `scene.engine`.
+    """
+
+    # A plain string, so that unknown names reach the check below, which lists the choices.
+    engine: str | None = eqx.field(static=True, default=None)
+    gradient: ClassVar[Gradient]
+
+    def __check_init__(self):
+        """Refuse unknown engines."""
+        if self.engine is not None and self.engine not in get_args(Engine):
+            raise ValueError(f'engine must be "mjx", "mujoco" or None, got {self.engine!r}')
+
+
+class Discrete(OwnMotion):
+    """MuJoCo's own motion, with the derivative of each step, equal to its finite differences; see `OwnMotion`."""
+
+    gradient = "discrete"
+
+
+class Slope(OwnMotion):
+    """MuJoCo's own motion, with the derivative whose mean is the slope of the outcome; see `OwnMotion`.
+
+    It includes the moving times of contact and limit events: along MuJoCo's motion, it is the derivative of a step with an
+    onset. See `native.events` for C MuJoCo.
+    """
+
+    gradient = "slope"
+
+
+Contact = Discrete | Slope | Onset | Smoothing
+
+
+def own_motion(gradient: str, engine: str | None = None) -> Discrete | Slope:
+    """Return the record of a derivative along MuJoCo's own motion, by its name.
+
+    Raises:
+        ValueError: if there is no such derivative or engine.
+    """
+    if gradient not in get_args(Gradient):
+        raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
+    return Slope(engine) if gradient == "slope" else Discrete(engine)
+
+
+def check_contact(contact: Any, *, is_step: bool = False) -> None:
+    """Refuse anything but one of the four records, and lengths with a leading axis.
+
+    Args:
+        contact: the argument to check.
+        is_step: whether it is for a step of MJX, which C MuJoCo cannot take.
+
+    Raises:
+        ValueError: if it is no such record, a length or width of it is no single number, or the engine does not fit.
+    """
+    if not isinstance(contact, Contact):
+        given = f'"{contact}"' if isinstance(contact, str) else repr(contact)
+        raise ValueError(f"contact must be mg.Discrete(), mg.Slope(), mg.Onset() or mg.Smoothing(), got {given}")
+    for field in dataclasses.fields(contact):
+        value = getattr(contact, field.name)
+        if isinstance(value, jax.Array) and value.ndim:
+            raise ValueError(
+                f"{field.name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap"
+            )
+    if is_step and getattr(contact, "engine", None) == "mujoco":
+        raise ValueError('contact must have engine None or "mjx" in a step of MJX, got "mujoco": use mg.rollout')
