@@ -18,6 +18,7 @@ from scipy import stats
 from experiments import theme
 from experiments.config import ExperimentError, suggest
 from experiments.problems import textbook
+from experiments.problems.comparison import Comparison, Rollouts, compare
 from experiments.problems.empirical_bias import EmpiricalBias, empirical_bias, first_order_samples
 from experiments.problems.textbook import Textbook
 from experiments.report import Table
@@ -26,7 +27,6 @@ from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import estimators as library
-from mjxgrad.diagnostics import Comparison, Rollouts, compare
 from mjxgrad.estimators import rules
 
 Count = Annotated[int, Field(ge=2)]

@@ -15,8 +15,10 @@ import mjxgrad as mg
 from experiments.long_horizon.problems import Problem, problem, vector
 from experiments.long_horizon.settings import Settings, Sizes
 from experiments.parallel import in_threads
+from experiments.problems.comparison import root_mean_square_interval
+from experiments.problems.growth import Growth, growth
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics import Crossover, crossover, growth, root_mean_square_interval
+from mjxgrad.diagnostics import Crossover, crossover
 
 # Standard errors of a mean. Two would do for one in twenty of normal samples; derivatives along chaotic motions have tails so
 # heavy that a few dozen repeats show too little of their spread.
@@ -299,7 +301,7 @@ def _simulated(one: Problem, params: Float[Array, "samples dim"], window: Int[Ar
 
 
 @eqx.filter_jit
-def _growth(one: Problem, params: Float[Array, "rollouts dim"], gradient: str) -> mg.diagnostics.Growth:
+def _growth(one: Problem, params: Float[Array, "rollouts dim"], gradient: str) -> Growth:
     return growth(jax.vmap(lambda p: one.jacobians(p, gradient))(params))
 
 

@@ -18,10 +18,10 @@ from experiments.motion import own_task
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.problems import published_scenes
+from experiments.problems.comparison import Comparison, Rollouts, affordable, bias_interval, compare
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
-from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
-from mjxgrad.diagnostics.comparison import affordable
+from mjxgrad.diagnostics import mean_interval
 from mjxgrad.estimators import GradientEstimate, Reason, rules
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.parallel import in_threads, processes
+from experiments.problems.soundness import soundness
 from experiments.stability.classes import (
     UNSOLVED,
     Derivative,
@@ -37,7 +38,6 @@ from experiments.stability.simulators import (
 )
 from experiments.workspace import Workspace
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
-from mjxgrad.diagnostics import soundness
 
 C_MUJOCO = "C MuJoCo"
 NOT_ASKED = -1
