@@ -15,6 +15,7 @@ from scipy import stats
 import mjxgrad as mg
 from experiments.config import ExperimentError
 from experiments.motion import own_task
+from experiments.optimisation import searches
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.problems import published_scenes
@@ -292,7 +293,7 @@ def _search(method: MethodSettings, task: Published) -> Callable[..., mg.Optimis
         # The controls are the parameters, so noise on the ones is noise on the others.
         width = jax.numpy.broadcast_to(objective.stddev, objective.noise_shape).ravel()
     own = {"num_elite": max(2, round(_ELITE * task.num_samples))} if method.name == "cross_entropy" else {}
-    search = getattr(mg.baselines, method.name)
+    search = getattr(searches, method.name)
     sizes = {"num_samples": task.num_samples, "num_steps": task.num_steps}
     return functools.partial(search, objective, task.params, stddev=width, **sizes, **own)
 
