@@ -37,7 +37,8 @@ def mppi(
     A candidate that is not finite has weight zero; a step with fewer than two finite ones is not taken.
 
     A low temperature $\lambda$ follows the best candidate, a high one averages over all. Its unit is the standard
-    deviation of the step's costs, so that the cost's unit has no effect. All other arguments, the result and the errors are those of `cross_entropy`.
+    deviation of the step's costs, so that the cost's unit has no effect. All other arguments, the result and the errors
+    are those of `cross_entropy`.
 
     References:
         Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based

@@ -19,8 +19,7 @@ Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
     "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
-MANY_PAIRS = 1000
-"""Fewest pairs of geoms whose number is a finding."""
+_MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
 _CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
@@ -48,11 +47,6 @@ class Slope:
     num_readings: int
     error: float
 
-    @property
-    def share_off(self) -> float:
-        """The share of all readings where the mean derivative is off."""
-        return self.num_off / max(self.num_readings, 1)
-
 
 @dataclass(frozen=True)
 class Recommendation:
@@ -79,7 +73,7 @@ class Recommendation:
 
 def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) -> Iterator[Finding]:
     """Yield findings from random motions and contact parameters alone."""
-    if len(scene.pairs) >= MANY_PAIRS:
+    if len(scene.pairs) >= _MANY_PAIRS:
         yield Finding("many_pairs", f"{len(scene.pairs)} pairs of geoms can touch: exclude those that never do.", True)
     for spring in steps_too_long(stability, touch_speed(motions)):
         yield Finding("time_step", _time_step(spring, touch_speed(motions)), True)

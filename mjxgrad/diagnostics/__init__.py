@@ -1,10 +1,9 @@
 """Measurements of how far gradients can be trusted."""
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, Landscape, bias_variance
-from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
-from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, derivative_against_slope, phases
+from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.diagnostics.statistics import mean_interval
 
@@ -18,9 +17,7 @@ __all__ = [
     "bias_variance",
     "check_stability",
     "compare_to_slope",
-    "contacts_needed",
     "crossover",
-    "derivative_against_slope",
     "jumps_along",
     "mean_interval",
     "phases",

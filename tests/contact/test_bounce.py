@@ -7,6 +7,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.contact.bounce import Bounce, integrated_restitution
+from mjxgrad.diagnostics import compare_to_slope, phases
 
 DURATION = 0.1
 TIMESTEP = 5e-4
@@ -27,7 +28,12 @@ def found():
         state = mg.initial_state(scene, qpos=start[None], qvel=jnp.array([-1.0]))
         return mg.rollout(scene, state, horizon=round(DURATION / TIMESTEP), gradient=gradient).qpos[-1, 0]
 
-    return mg.diagnostics.derivative_against_slope(height, (0.005, 0.025), num_phases=64)
+    starts = phases((0.005, 0.025), 64)
+    moved = {
+        name: jax.jit(jax.vmap(jax.value_and_grad(lambda x, name=name: height(x, name))))(jnp.asarray(starts))
+        for name in ("discrete", "slope")
+    }
+    return compare_to_slope(starts, moved["discrete"][0], [slope for _, slope in moved.values()])
 
 
 @pytest.mark.parametrize("damping_ratio", [0.1, 0.6, 1.0, 1.00003, 2.0])
