@@ -11,8 +11,13 @@ import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cyclopts
 import numpy as np
+
+try:
+    import cyclopts
+except ImportError:
+    print("the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'", file=sys.stderr)
+    sys.exit(2)
 
 TEMPLATE = '''\
 """{name}: controls that move it, found by {estimator} gradients through contact; and their video."""

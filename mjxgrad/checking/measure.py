@@ -159,10 +159,10 @@ def measure(
         is_first = not found and not left_out
         mover.end = max(end, time.perf_counter() + 2 * seconds) if is_first else end
         # The duration is estimated from the previous steps.
-        has_time = time.perf_counter() + num_batches * num_steps * mover.step_seconds <= mover.end
         try:
-            found += [task()] if has_time else []
-            left_out += [] if has_time else [words]
+            if time.perf_counter() + num_batches * num_steps * mover.step_seconds > mover.end:
+                raise TimeoutError
+            found.append(task())
         except TimeoutError:
             left_out.append(words)
     return Measured(
