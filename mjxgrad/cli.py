@@ -213,16 +213,16 @@ def identify(
     """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
 
     A recording is a CSV with a line of names, or an NPZ. It has a column time (s). The others are named by joints
-    (positions),
-    sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator, act:actuator. An element
-    with several numbers takes an index, qpos:root[0], or qpos[7] in the whole. The controls of all actuators are needed.
+    (positions), sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator,
+    act:actuator. An element with several numbers takes an index, qpos:root[0], or qpos[7] in the whole. The controls of
+    all actuators are needed.
 
     Args:
         scene: an MJCF file.
         recordings: CSV or NPZ files, before the options.
-        parameter: kind:name, kind:name=low..high, or YAML of mujoco.sysid with such names. Kinds are mass, inertia (bodies),
-            friction, stiffness, damping_ratio, width (geoms, geom/geom or nothing for all), damping, armature, friction_loss
-            (joints), gear, gains (actuators) and delay. kind:one,other is one value for both.
+        parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
+            width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
+            (actuators) and delay. kind:one,other is one value for both.
         held_out: share for validation only: every n-th recording or window, or the end of a single one.
         window: duration in s of windows to cut recordings into, each from its measured state.
         free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
@@ -241,7 +241,7 @@ def identify(
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     loaded = mg.load_scene(_existing(scene), keep_everything=True)
-    wanted = files.parameters(loaded, parameter)
+    wanted = {text.partition("=")[0]: files.parameter(loaded, text) for text in parameter}
     motions = []
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path))

@@ -405,7 +405,7 @@ def _program(
         if has_alpha:
             mixed = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)
         found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
-        if num_cells is not None:
+        if isinstance(objective, ParameterNoise) and num_cells is not None:
             return found | _by_landscape(objective, params, reference_key, num_cells), samples, mixed[1]
         unbiased = jax.vmap(_unbiased)(by_noise) if plan.by_noise else (zeroth.value, zeroth.standard_error)
         found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
