@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -108,6 +109,12 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def _timed() -> Callable[[str], None]:
+    """Return a function that says what is done, with the seconds since now."""
+    started = time.monotonic()
+    return lambda text: _say(f"{time.monotonic() - started:4.0f} s  {text}")
+
+
 @app.command
 def check(
     scene: str,
@@ -131,11 +138,7 @@ def check(
         seed: seed of all random numbers.
     """
     _writable(html, is_page=True)
-    mg, started = _library(), time.monotonic()
-
-    def log(text: str) -> None:
-        _say(f"{time.monotonic() - started:4.0f} s  {text}")
-
+    mg, log = _library(), _timed()
     function = None if cost is None else importlib.import_module("mjxgrad.checking.sweep").load_function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict.as_json() if as_json else verdict.summary(), flush=True)
@@ -179,7 +182,7 @@ def sweep(
     if not html.parent.is_dir():
         raise CommandError(f"there is no folder {html.parent} for {html}")
     _writable(html, is_page=True)
-    mg, started = _library(), time.monotonic()
+    mg, log = _library(), _timed()
     found = mg.sweep(
         _existing(scene),
         cost,
@@ -188,7 +191,7 @@ def sweep(
         num_samples=samples,
         num_reference=8 * samples,
         seed=seed,
-        log=lambda text: _say(f"{time.monotonic() - started:4.0f} s  {text}"),
+        log=log,
         start=start,
         horizon=horizon,
         gradient=gradient,
@@ -196,7 +199,7 @@ def sweep(
     )
     print(found)
     html.write_text(found.as_html(), encoding="utf-8")
-    _say(f"wrote {html}")
+    log(f"wrote {html}")
 
 
 @app.command
@@ -230,14 +233,10 @@ def identify(
         as_json: write JSON.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
-    mg, started = _library(), time.monotonic()
+    mg, log, started = _library(), _timed(), time.monotonic()
     files, page = (
         importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "identification.page")
     )
-
-    def log(text: str) -> None:
-        _say(f"{time.monotonic() - started:4.0f} s  {text}")
-
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     loaded = mg.load_scene(_existing(scene), keep_everything=True)
