@@ -19,13 +19,13 @@ from experiments import theme
 from experiments.config import ExperimentError, suggest
 from experiments.problems import estimators as library
 from experiments.problems import textbook
+from experiments.problems.comparison import Comparison, Rollouts, compare
 from experiments.problems.textbook import Textbook
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
-from mjxgrad.diagnostics import Comparison, Rollouts, compare
 from mjxgrad.estimators import rules
 
 Count = Annotated[int, Field(ge=2)]

@@ -1,11 +1,9 @@
-r"""Gradient-free baselines in the same loop, with rollouts counted alike.
+r"""Search without derivatives in the same loop, with rollouts counted alike.
 
-Each draws candidates $\theta_i = \mu + \sigma \epsilon_i$ around the present point $\mu$ and updates it by its own
+A search draws candidates $\theta_i = \mu + \sigma \epsilon_i$ around the present point $\mu$ and moves it by its own
 rule. The search noise replaces the objective's noise: candidates are rolled out without it, or, where a task's
 start is random, each with its own start. The cost in the history is the mean over the candidates. The best
 parameters are among the points $\mu$, whose noise-free cost `evaluate` measures.
-
-The methods are short, and a library of them would require a neural-network framework.
 """
 
 import dataclasses
@@ -25,7 +23,7 @@ from mjxgrad.loop.run import run
 from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise
 from mjxgrad.objective.base import as_objective
 
-__all__ = ["cross_entropy", "mppi", "predictive_sampling"]
+__all__ = ["Population", "cross_entropy"]
 
 Move = Callable[[Float[Array, " dim"], Float[Array, " dim"], Array, Array], tuple[Array, Array]]
 
@@ -71,18 +69,12 @@ def cross_entropy(
     num_elite: int,
     num_steps: int,
     stddev: ArrayLike | None = None,
-    keep: float = 0.0,
-    min_stddev: float = 0.0,
     **options: Any,
 ) -> Optimisation:
     r"""Minimise a cost by the cross-entropy method.
 
     Every step draws candidates from $N(\mu, \mathrm{diag}\,\sigma^2)$ and fits $\mu$ and $\sigma$ to the `num_elite`
-    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$):
-
-    $$\mu \leftarrow \kappa \mu + (1 - \kappa)\, \mathrm{mean}(\mathrm{elite}), \qquad
-      \sigma \leftarrow \kappa \sigma + (1 - \kappa)\, \mathrm{std}(\mathrm{elite}).$$
-
+    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$).
     Candidates are rolled out without the objective's noise, from random starts where the task has them. Candidates that are
     not finite are never elite. A step with fewer than `num_elite` finite ones is not taken.
 
@@ -95,8 +87,6 @@ def cross_entropy(
         num_steps: largest number of steps.
         stddev: the first $\sigma$, in the parameters' units; one number, or one per parameter. None takes the
             objective's noise, if it is on the parameters.
-        keep: $\kappa \in [0, 1)$, share of the old fit.
-        min_stddev: least $\sigma$, against early convergence.
         **options: see `RunOptions`.
 
     Returns:
@@ -107,99 +97,17 @@ def cross_entropy(
 
     References:
         De Boer, Kroese, Mannor, Rubinstein. A tutorial on the cross-entropy method. Annals of Operations Research 134,
-        2005, section 5 (continuous optimisation, with smoothing of the fit).
+        2005, section 5 (continuous optimisation).
     """
     width = search_stddev(objective, params, stddev, num_samples)
     if not 2 <= whole("num_elite", num_elite, None) <= num_samples:
         raise ValueError(f"num_elite must be at least 2 and at most num_samples = {num_samples}, got {num_elite}")
-    if not 0 <= keep < 1:
-        raise ValueError(f"keep must be at least 0 and below 1, got {keep}")
-    if not min_stddev >= 0:
-        raise ValueError(f"min_stddev must be at least 0, got {min_stddev}")
 
-    def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
+    def move(_mean: Array, _stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
         elite = at[jnp.argsort(costs)[:num_elite]]
-        new = keep * mean + (1 - keep) * elite.mean(axis=0)
-        return new, jnp.maximum(keep * stddev + (1 - keep) * elite.std(axis=0), min_stddev)
+        return elite.mean(axis=0), elite.std(axis=0)
 
     method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples, least_finite=num_elite)
-    return run(method, **method.begun(params, key))
-
-
-def mppi(
-    objective: Objective,
-    params: Float[Array, "..."],
-    key: Key[Array, "..."],
-    *,
-    num_samples: int,
-    num_steps: int,
-    temperature: float = 0.1,
-    is_relative: bool = True,
-    stddev: ArrayLike | None = None,
-    **options: Any,
-) -> Optimisation:
-    r"""Minimise a cost by the update of model-predictive path integral control.
-
-    $$\mu \leftarrow \mu + \sum_i \frac{\exp(-f_i/\lambda)}{\sum_j \exp(-f_j/\lambda)}\, \sigma\epsilon_i,
-      \qquad f_i = f(\mu + \sigma\epsilon_i).$$
-
-    Each step plans the whole horizon anew; nothing is shifted or executed in between. The cost is the objective's alone,
-    without the cited method's extra charge $\lambda\mu^\top\Sigma^{-1}\epsilon$ for control.
-    A candidate that is not finite has weight zero; a step with fewer than two finite ones is not taken.
-
-    A low temperature $\lambda$ follows the best candidate, a high one averages over all. If `is_relative`, its unit is the
-    standard deviation of the step's costs, so that the cost's unit has no effect; otherwise it is the cost's unit.
-    All other arguments, the result and the errors are those of `cross_entropy`.
-
-    References:
-        Williams, Wagener, Goldfain, Drews, Rehg, Boots, Theodorou. Information theoretic MPC for model-based
-        reinforcement learning. ICRA 2017, algorithm 2. Theodorou, Buchli, Schaal. A generalized path integral control
-        approach to reinforcement learning. JMLR 11, 2010, section 3.3 (there with the costs' range as their unit).
-    """
-    width = search_stddev(objective, params, stddev, num_samples)
-    if not temperature > 0:
-        raise ValueError(f"temperature must be positive, got {temperature}; predictive_sampling takes the best alone")
-
-    def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
-        scale = jnp.asarray(temperature, costs.dtype)
-        if is_relative:
-            spread = jnp.std(costs, where=jnp.isfinite(costs))
-            # For equal costs any temperature gives equal weights, but zero would give 0/0.
-            scale *= jnp.where(spread > 0, spread, 1)
-        # Weighted offsets, not candidates: equal to rounding, and exact for a single weight of one.
-        return mean + jax.nn.softmax(-costs / scale) @ (at - mean), stddev
-
-    method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples)
-    return run(method, **method.begun(params, key))
-
-
-def predictive_sampling(
-    objective: Objective,
-    params: Float[Array, "..."],
-    key: Key[Array, "..."],
-    *,
-    num_samples: int,
-    num_steps: int,
-    stddev: ArrayLike | None = None,
-    **options: Any,
-) -> Optimisation:
-    r"""Minimise a cost by moving to the best candidate, including the present point.
-
-    The cost without noise never rises, unless the task's start is random. Arguments, result and errors are as in
-    `cross_entropy`.
-
-    References:
-        Howell, Gileadi, Tunyasuvunakool, Zakka, Erez, Tassa. Predictive sampling: real-time behaviour synthesis with
-        MuJoCo. 2022, arXiv:2212.00541, algorithm 1.
-    """
-    width = search_stddev(objective, params, stddev, num_samples)
-
-    def move(mean: Array, stddev: Array, at: Array, costs: Array) -> tuple[Array, Array]:
-        return at[jnp.argmin(costs)], stddev
-
-    method = Population(
-        RunOptions(num_steps, **options), objective, width, move, num_samples, least_finite=1, has_present=True
-    )
     return run(method, **method.begun(params, key))
 
 

@@ -8,11 +8,17 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import cyclopts
 import numpy as np
+
+try:
+    import cyclopts
+except ImportError:
+    print("the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'", file=sys.stderr)
+    sys.exit(2)
 
 TEMPLATE = '''\
 """{name}: controls that move it, found by {estimator} gradients through contact; and their video."""
@@ -103,6 +109,12 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def _timed() -> Callable[[str], None]:
+    """Return a function that says what is done, with the seconds since now."""
+    started = time.monotonic()
+    return lambda text: _say(f"{time.monotonic() - started:4.0f} s  {text}")
+
+
 @app.command
 def check(
     scene: str,
@@ -126,11 +138,7 @@ def check(
         seed: seed of all random numbers.
     """
     _writable(html, is_page=True)
-    mg, started = _library(), time.monotonic()
-
-    def log(text: str) -> None:
-        _say(f"{time.monotonic() - started:4.0f} s  {text}")
-
+    mg, log = _library(), _timed()
     function = None if cost is None else importlib.import_module("mjxgrad.checking.sweep").load_function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict.as_json() if as_json else verdict.summary(), flush=True)
@@ -174,7 +182,7 @@ def sweep(
     if not html.parent.is_dir():
         raise CommandError(f"there is no folder {html.parent} for {html}")
     _writable(html, is_page=True)
-    mg, started = _library(), time.monotonic()
+    mg, log = _library(), _timed()
     found = mg.sweep(
         _existing(scene),
         cost,
@@ -183,14 +191,14 @@ def sweep(
         num_samples=samples,
         num_reference=8 * samples,
         seed=seed,
-        log=lambda text: _say(f"{time.monotonic() - started:4.0f} s  {text}"),
+        log=log,
         start=start,
         horizon=horizon,
         contact=mg.stepping.own_motion(gradient, engine),
     )
     print(found)
     html.write_text(found.as_html(), encoding="utf-8")
-    _say(f"wrote {html}")
+    log(f"wrote {html}")
 
 
 @app.command
@@ -207,16 +215,16 @@ def identify(
     """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
 
     A recording is a CSV with a line of names, or an NPZ. It has a column time (s). The others are named by joints
-    (positions),
-    sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator, act:actuator. An element
-    with several numbers takes an index, qpos:root[0], or qpos[7] in the whole. The controls of all actuators are needed.
+    (positions), sensors and actuators (controls), or in full qpos:joint, qvel:joint, sensor:name, ctrl:actuator,
+    act:actuator. An element with several numbers takes an index, qpos:root[0], or qpos[7] in the whole. The controls of
+    all actuators are needed.
 
     Args:
         scene: an MJCF file.
         recordings: CSV or NPZ files, before the options.
-        parameter: kind:name, kind:name=low..high, or YAML of mujoco.sysid with such names. Kinds are mass, inertia (bodies),
-            friction, stiffness, damping_ratio, width (geoms, geom/geom or nothing for all), damping, armature, friction_loss
-            (joints), gear, gains (actuators) and delay. kind:one,other is one value for both.
+        parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
+            width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
+            (actuators) and delay. kind:one,other is one value for both.
         held_out: share for validation only: every n-th recording or window, or the end of a single one.
         window: duration in s of windows to cut recordings into, each from its measured state.
         free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
@@ -224,18 +232,14 @@ def identify(
         as_json: write JSON.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
-    mg, started = _library(), time.monotonic()
+    mg, log, started = _library(), _timed(), time.monotonic()
     files, page = (
         importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "identification.page")
     )
-
-    def log(text: str) -> None:
-        _say(f"{time.monotonic() - started:4.0f} s  {text}")
-
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     loaded = mg.load_scene(_existing(scene), keep_everything=True)
-    wanted = files.parameters(loaded, parameter)
+    wanted = {text.partition("=")[0]: files.parameter(loaded, text) for text in parameter}
     motions = []
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path))

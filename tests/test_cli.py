@@ -117,6 +117,13 @@ def test_importing_the_library_imports_no_command_line_and_no_pictures():
     assert ran.stdout.strip() == "[]"
 
 
+def test_without_its_package_the_command_line_says_what_brings_it():
+    code = "import sys; sys.modules['cyclopts'] = None; import mjxgrad.__main__"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert ran.returncode == 2
+    assert ran.stderr == "the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'\n"
+
+
 @pytest.mark.slow
 def test_a_new_program_moves_the_scene_and_films_it(scene):
     assert cli.main(["new", scene]) == 0

@@ -63,7 +63,8 @@ FOUND = {
     "first(cost=lambda x: x)": "function must return a scalar of shape (), got shape (2,)",
     "first(count='8')": "num_samples must be a whole number, got '8'",
     "estimators.zeroth_order(noisy, params, key, num_samples='8')": "num_samples must be a whole number, got '8'",
-    "mg.baselines.predictive_sampling(noisy, params, key, num_samples=2.5, num_steps=2)": "num_samples must be a whole number",
+    "mg.baselines.cross_entropy(noisy, params, key, num_samples=2.5, num_elite=2, num_steps=2)":
+        "num_samples must be a whole number, got 2.5",
     "elite(2.5)": "num_elite must be a whole number, got 2.5",
     "mg.diagnostics.bias_variance(lambda k: noisy, params[None], key, softness=params, num_samples=4, num_reference='9')":
         "num_reference must be a whole number, got '9'",

@@ -15,13 +15,14 @@ from scipy import stats
 import mjxgrad as mg
 from experiments.config import ExperimentError
 from experiments.motion import own_task
+from experiments.optimisation import searches
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.problems import estimators, published_scenes
+from experiments.problems.comparison import Comparison, Rollouts, affordable, bias_interval, compare
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
-from mjxgrad.diagnostics import Comparison, Rollouts, bias_interval, compare, mean_interval
-from mjxgrad.diagnostics.comparison import affordable
+from mjxgrad.diagnostics import mean_interval
 from mjxgrad.estimators import GradientEstimate, Reason, rules
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
@@ -292,7 +293,7 @@ def _search(method: MethodSettings, task: Published) -> Callable[..., mg.Optimis
         # The controls are the parameters, so noise on the ones is noise on the others.
         width = jax.numpy.broadcast_to(objective.stddev, objective.noise_shape).ravel()
     own = {"num_elite": max(2, round(_ELITE * task.num_samples))} if method.name == "cross_entropy" else {}
-    search = getattr(mg.baselines, method.name)
+    search = getattr(searches, method.name)
     sizes = {"num_samples": task.num_samples, "num_steps": task.num_steps}
     return functools.partial(search, objective, task.params, stddev=width, **sizes, **own)
 

@@ -20,7 +20,7 @@ class MethodSettings(SettingsTable):
         "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "reinforce",
         "cross_entropy", "mppi", "predictive_sampling",
     ]  # fmt: skip
-    """Of a function in `mjxgrad.estimators` or `mjxgrad.baselines`."""
+    """Of a function in `mjxgrad.estimators` or in `searches.py`."""
     baseline: Literal["leave_one_out", "zero_noise", "none"] | None = None
     """Of zeroth order and REINFORCE; their own default if it is not set."""
     antithetic: bool | None = None

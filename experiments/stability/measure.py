@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 import mjxgrad as mg
 from experiments.parallel import in_threads
+from experiments.problems.soundness import soundness
 from experiments.stability.scenes import (
     FIELDS,
     GRAVITY,
@@ -29,7 +30,6 @@ from experiments.stability.scenes import (
 from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
-from mjxgrad.diagnostics import soundness
 
 C_MUJOCO = "C MuJoCo"
 NOT_ASKED = -1

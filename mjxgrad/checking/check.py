@@ -1,5 +1,6 @@
 """One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -8,7 +9,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 from mjxgrad._text import format_number
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import (
-    MANY_PAIRS,
     WORDS,
     Finding,
     Recommendation,
@@ -32,14 +31,12 @@ from mjxgrad.checking.findings import (
     touch_speed,
 )
 from mjxgrad.checking.measure import Measured, measure
-from mjxgrad.checking.motions import Motions, first_keyframe, half_range, random_motions
+from mjxgrad.checking.motions import Motions, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.checking.moving import Mover, Outcomes
-from mjxgrad.diagnostics.contacts import contacts_needed
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page
 from mjxgrad.rollouts import Trajectory
 from mjxgrad.scene import Scene, SceneError, load_scene
-from mjxgrad.scene.load import count_pairs
 from mjxgrad.stepping import Engine
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
@@ -185,7 +182,7 @@ def check(
     rng, started = np.random.default_rng(seed), time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scene, path = _load(source, say)
+        scene, path = _load(source)
         spent = {"loading": time.perf_counter() - started}
         motions = random_motions(scene, rng)
         scene, max_contacts = _with_room(scene, motions)
@@ -200,12 +197,10 @@ def check(
         say(f"measuring derivatives by {'MJX, which compiles first' if engine == 'mjx' else 'C MuJoCo'}")
         measuring = time.perf_counter()
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget, engine)
-        try:
+        with contextlib.suppress(TimeoutError):
             measured = measure(
                 scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
             )
-        except TimeoutError:
-            measured = None
         found += measured_findings(measured) if measured and measured.lines else ()
         spent["measuring"] = time.perf_counter() - measuring
         found += left_out_findings(measured if measured and measured.lines else None, budget)
@@ -225,43 +220,25 @@ def check(
     )
 
 
-def _load(source: Source, say: Callable[[str], None]) -> tuple[Scene, str]:
+def _load(source: Source) -> tuple[Scene, str]:
     """Return the scene, and the name of its file in code."""
     if isinstance(source, Scene):
         return source, "scene.xml"
-    is_file = isinstance(source, os.PathLike) or (
-        isinstance(source, str) and not source.lstrip("\ufeff \t\r\n").startswith("<")
-    )
     if isinstance(source, mujoco.MjSpec):
         try:
             source = source.compile()
         except ValueError as error:
             raise SceneError(f"the MjSpec must be one that MuJoCo compiles, but it says: {error}") from error
-    if is_file and Path(source).is_file():  # pyright: ignore[reportArgumentType]
-        _look_at_pairs(mujoco.MjModel.from_xml_path, str(source), say)
-    elif isinstance(source, str) and not is_file:
-        _look_at_pairs(mujoco.MjModel.from_xml_string, source, say)
-    elif isinstance(source, mujoco.MjModel):
-        _look_at_pairs(lambda model: model, source, say)
+    is_text = isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<")
+    is_file = isinstance(source, str | os.PathLike) and not is_text
     return load_scene(source), str(source) if is_file else "scene.xml"
-
-
-def _look_at_pairs(read: Callable, argument: Any, say: Callable[[str], None]) -> None:
-    """Return a finding about too many pairs of geoms that can touch; sources that cannot be read are left to `load_scene`."""
-    try:
-        model = read(argument)
-    except ValueError:
-        return
-    count = count_pairs(model)
-    if count >= MANY_PAIRS:
-        say(f"at least {count} pairs of geoms can touch: loading takes a while; exclude those that never do")
 
 
 def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
     """Return the scene with fewer contact slots, if motions needed far fewer than all."""
     if not scene.pairs:
         return scene, None
-    needed = max(contacts_needed(scene, motions.trajectory(i)) for i in range(len(motions.poses)))
+    needed = most_contacts(scene, motions.qpos)
     # Motions along lines may have more contacts than these.
     room = 2 * needed + _SPARE_CONTACTS
     if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):

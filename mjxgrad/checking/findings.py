@@ -19,8 +19,7 @@ Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
     "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
-MANY_PAIRS = 1000
-"""Fewest pairs of geoms whose number is a finding."""
+_MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
 _CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
@@ -49,11 +48,6 @@ class Slope:
     num_readings: int
     error: float
 
-    @property
-    def share_off(self) -> float:
-        """The share of all readings where the mean derivative is off."""
-        return self.num_off / max(self.num_readings, 1)
-
 
 @dataclass(frozen=True)
 class Recommendation:
@@ -80,10 +74,10 @@ class Recommendation:
 
 def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) -> Iterator[Finding]:
     """Yield findings from random motions and contact parameters alone."""
-    if len(scene.pairs) >= MANY_PAIRS:
+    if len(scene.pairs) >= _MANY_PAIRS:
         yield Finding("many_pairs", f"{len(scene.pairs)} pairs of geoms can touch: exclude those that never do.", True)
-    for spring in steps_too_long(stability, touch_speed(motions)):
-        yield Finding("time_step", _time_step(spring, touch_speed(motions)), True)
+    for spring in _steps_too_long(stability):
+        yield Finding("time_step", _time_step(spring), True)
     bad = [pose for pose, step in zip(motions.poses, motions.bad_steps, strict=True) if step >= 0]
     if bad:
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
@@ -227,7 +221,7 @@ def recommend(
     scene: Scene, motions: Motions, stability: StabilityReport, measured: Measured | None, max_contacts: int | None
 ) -> Recommendation:
     """Return the recommended settings from measurements; without measurements, safe ones."""
-    needed = [largest_step(spring, touch_speed(motions)) for spring in steps_too_long(stability, touch_speed(motions))]
+    needed = [_largest_step(spring) for spring in _steps_too_long(stability)]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
@@ -251,11 +245,10 @@ def recommend(
     ]
     limit = min(limits, default=math.inf)
     is_limited = limit < measured.times[-1]
-    is_unknown = not measured.lines or not own
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
         gradient=best.kind,
-        estimator="alpha_order" if has_jumps or is_limited or is_unknown else "first_order",
+        estimator="alpha_order" if has_jumps or is_limited or not own else "first_order",
         stddev=stddev,
         horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),
         timestep=timestep,
@@ -269,33 +262,34 @@ def touch_speed(motions: Motions) -> float | None:
     return max((touch.speed for touch in motions.touches if touch.speed > 0), default=None)
 
 
-def steps_too_long(stability: StabilityReport, speed: float | None) -> list[Spring]:
+def _steps_too_long(stability: StabilityReport) -> list[Spring]:
     """Return the springs for which the time step is too long, one of each group of equal ones."""
-    found = [one for one in stability.springs if largest_step(one, speed) < one.timestep * (1 - 1e-6)]
+    found = [one for one in stability.springs if _largest_step(one) < one.timestep * (1 - 1e-6)]
     return list({(one.kind, one.given, round(one.coupled_load, 6), one.stiffness): one for one in found}.values())
 
 
-def largest_step(spring: Spring, speed: float | None) -> float:
+def _largest_step(spring: Spring) -> float:
     """Return the longest time step in s that resolves a spring: as its file asks, stable, and not passing through."""
     asked = spring.given / 2 if spring.is_hidden and spring.given is not None else math.inf
-    passed = spring.size / speed if speed and spring.kind == "contact" else math.inf
+    passed = spring.size / spring.speed if spring.speed and spring.kind == "contact" else math.inf
     return min(asked, spring.timestep / spring.coupled_load if spring.coupled_load >= 1 else math.inf, passed)
 
 
-def _time_step(spring: Spring, speed: float | None) -> str:
-    step, needed = 1e3 * spring.timestep, format_number(1e3 * largest_step(spring, speed))
+def _time_step(spring: Spring) -> str:
+    step, needed = 1e3 * spring.timestep, format_number(1e3 * _largest_step(spring))
     what = f"The time step of {step:g} ms is too long for {spring.kind} {spring.name}"
     if spring.is_hidden and spring.given is not None:
         asked, used = (format_number(1e3 * t) for t in (spring.given, spring.time_constant))
         return f"{what}: the file asks for a time constant of {asked} ms and gets {used} ms. At most {needed} ms."
     if spring.coupled_load >= 1:
         return f"{what}: it gains energy. Take less than {needed} ms, or a softer contact."
-    return f"{what}: at {speed:.2g} m/s it passes through. Take less than {needed} ms."
+    return f"{what}: at {spring.speed:.2g} m/s it passes through. Take less than {needed} ms."
 
 
 def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
     """Return the answer in at most 15 words."""
-    answer = f"{WORDS[advice.gradient]} and {advice.estimator}, {advice.horizon * motions.timestep:.2g} s ahead"
+    ahead = f"{advice.horizon * motions.timestep:.2g} s ahead"
+    answer = f"{WORDS[advice.gradient]} and {advice.estimator}, {ahead}"
     minded = [finding.kind for finding in findings if finding.is_fault or finding.kind == "not_measured"]
     words = {
         "time_step": "the time step is too long",

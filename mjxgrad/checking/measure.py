@@ -150,33 +150,27 @@ def measure(
         for stddev, stiffness in settings
     ]
 
-    def in_time(_: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
-        # Estimated from the previous steps.
-        seconds = num_batches * num_steps * mover.step_seconds
-        if time.perf_counter() + seconds > mover.end:
-            return None
-        try:
-            return task()
-        except TimeoutError:
-            return None
-
-    def first(words: str, num_batches: int, task: Callable[[], Line | Noise]) -> Line | Noise | None:
-        # A verdict without a line is useless: the first one may take twice the remaining time.
-        end, mover.end = mover.end, max(mover.end, time.perf_counter() + 2 * seconds)
-        found = in_time(words, num_batches, task)
-        mover.end = end
-        return found
-
     # In order of importance, since the last are left out where time is short.
     asked = [lines[0], noises[0], *lines[1:], *noises[1:]]
+    found, left_out, end = [], [], mover.end
     # One after the other: two at once deadlocked on dm_control's humanoid (two cores, jax 0.10.2).
-    found = [(first if one is asked[0] else in_time)(*one) for one in asked]
+    for words, num_batches, task in asked:
+        # A verdict without a line is useless: the first one may take twice the remaining time.
+        is_first = not found and not left_out
+        mover.end = max(end, time.perf_counter() + 2 * seconds) if is_first else end
+        # The duration is estimated from the previous steps.
+        try:
+            if time.perf_counter() + num_batches * num_steps * mover.step_seconds > mover.end:
+                raise TimeoutError
+            found.append(task())
+        except TimeoutError:
+            left_out.append(words)
     return Measured(
         np.array(lengths) * motions.timestep,
         num_steps,
         tuple(one for one in found if isinstance(one, Line)),
         tuple(one for one in found if isinstance(one, Noise)),
-        tuple(words for (words, *_), one in zip(asked, found, strict=True) if one is None),
+        tuple(left_out),
     )
 
 

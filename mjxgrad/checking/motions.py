@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjxgrad.contact.parameters import geom_name
-from mjxgrad.rollouts import State, Trajectory
+from mjxgrad.rollouts import State
 from mjxgrad.rollouts.state import pose_warnings
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
@@ -24,6 +24,7 @@ _REACH = 0.8  # share of half the range, so that small changes are not clipped
 _REPLAYED = 100  # steps before and after the first touch, within which effects show
 _SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding in double precision over these steps
 _FASTEST = 1e4  # m/s, rad/s: a faster rollout counts as diverged
+_CLEARANCE = 0.01  # m, beyond the margin: a nearer pair may touch in similar motions
 _Start = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -77,13 +78,6 @@ class Motions:
         """Return the state of a motion after a number of steps."""
         qpos, qvel, act = (jnp.asarray(x[motion, step], float) for x in (self.qpos, self.qvel, self.act))
         return State(qpos, qvel, act, time=jnp.asarray(step * self.timestep), warmstart=jnp.zeros_like(qvel))
-
-    def trajectory(self, motion: int) -> Trajectory:
-        """Return one motion as a `Trajectory`, for diagnostics of recorded motions."""
-        first_bad = jnp.asarray(int(self.bad_steps[motion]))
-        arrays = [jnp.asarray(x[motion], float) for x in (self.qpos, self.qvel, self.controls)]
-        final = self.state(motion, -1)
-        return Trajectory(*arrays, observations=None, final=final, diverged=first_bad >= 0, first_bad_step=first_bad)
 
 
 def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
@@ -184,6 +178,18 @@ def _touches(
         before = set(now)
     named = [Touch(_pair(model, pair), *when) for pair, when in found.items()]
     return tuple(sorted(named, key=lambda touch: touch.time)), tuple(_pair(model, pair) for pair in always), onsets
+
+
+def most_contacts(scene: Scene, qpos: Float[np.ndarray, "motions states nq"]) -> int:
+    """Return the largest number of near contacts of one friction dimension in any pose; at least 1."""
+    model = scene.to_mujoco()
+    model.geom_margin[:] += _CLEARANCE / 2  # the margins of both geoms add up
+    data, most = mujoco.MjData(model), 1
+    for pose in qpos.reshape(-1, model.nq):
+        data.qpos[:] = pose
+        mujoco.mj_fwdPosition(model, data)
+        most = max(most, *np.bincount(data.contact.dim, minlength=1).tolist())
+    return most
 
 
 def _pair(model: mujoco.MjModel, geoms: tuple[int, ...]) -> str:

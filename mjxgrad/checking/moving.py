@@ -137,7 +137,7 @@ class Mover:
         path = [np.where(bad[:, None, None], part[:, :1], part) for part in path]
         nv = self.scene.model.nv
         course = np.concatenate([np.tile(change, (num, 1, 1)), np.where(bad[:, None, None], 0.0, course)], axis=1)
-        coordinates = self._coordinates(path[0], course[..., :nv])
+        coordinates = self._turned(to_coordinates, path[0], course[..., :nv])
         outcomes, derivatives = self._judge(tuple(lengths))(
             (*path, controls, bad), (coordinates, course[..., nv : 2 * nv], course[..., 2 * nv :], pushes)
         )
@@ -168,7 +168,7 @@ class Mover:
             def run(qpos: Array, qvel: Array, act: Array, ctrl: Array) -> tuple:
                 state = State(qpos, qvel, act, jnp.zeros((), dtype), jnp.zeros_like(qvel))
                 course = rollout(
-                    with_contact(scene, contact),
+                    eqx.tree_at(lambda s: s.model, scene, scene.model.replace(**contact)),
                     state,
                     ctrl,
                     contact=own_motion(kind, "mjx"),
@@ -184,18 +184,13 @@ class Mover:
             lowered = jax.jit(jax.vmap(one, in_axes=(None, 0, 0))).lower(contact, *given)
             self._compiled[key] = lowered.compile(compiler_options=compiler_options())
         path, (turned, *rest) = jax.tree.map(lambda x: np.asarray(x, float), self._compiled[key](contact, *given))
-        return list(path), np.concatenate([self._tangents(path[0], turned), *rest], axis=2)
+        return list(path), np.concatenate([self._turned(to_tangent, path[0], turned), *rest], axis=2)
 
-    def _coordinates(self, qpos: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Return the tangents of poses as changes of coordinates."""
+    def _turned(self, convert: Callable, qpos: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Return the tangents of poses as changes of coordinates, or the reverse."""
         if self.scene.model.nq == self.scene.model.nv:
             return change
-        return np.asarray(_to_coordinates(self.scene, jnp.asarray(qpos), jnp.asarray(change, qpos.dtype)))
-
-    def _tangents(self, qpos: np.ndarray, change: np.ndarray) -> np.ndarray:
-        if self.scene.model.nq == self.scene.model.nv:
-            return change
-        return np.asarray(_to_tangents(self.scene, jnp.asarray(qpos), jnp.asarray(change)))
+        return np.asarray(_over_all(convert, self.scene, jnp.asarray(qpos), jnp.asarray(change, qpos.dtype)))
 
     def _judge(self, lengths: tuple[int, ...]) -> Callable:
         """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""
@@ -226,15 +221,8 @@ class Mover:
 
 
 @eqx.filter_jit
-def _to_coordinates(
-    scene: Scene, qpos: Float[Array, "a b nq"], change: Float[Array, "a b nv"]
-) -> Float[Array, "a b nq"]:
-    return jax.vmap(jax.vmap(lambda q, v: to_coordinates(scene, q, v)))(qpos, change)
-
-
-@eqx.filter_jit
-def _to_tangents(scene: Scene, qpos: Float[Array, "a b nq"], change: Float[Array, "a b nq"]) -> Float[Array, "a b nv"]:
-    return jax.vmap(jax.vmap(lambda q, v: to_tangent(scene, q, v)))(qpos, change)
+def _over_all(convert: Callable, scene: Scene, qpos: Float[Array, "a b nq"], change: Float[Array, "a b _"]) -> Array:
+    return jax.vmap(jax.vmap(lambda q, v: convert(scene, q, v)))(qpos, change)
 
 
 def moved(
@@ -261,11 +249,6 @@ def change_of_poses(
 def contact_of(model: mjx.Model) -> dict[str, Array]:
     """Return the fields of a model that `Softness` changes, except margins."""
     return {name: jnp.asarray(getattr(model, name)) for name in CONTACT_FIELDS}
-
-
-def with_contact(scene: Scene, contact: dict[str, Array]) -> Scene:
-    """Return the scene with other contact parameters."""
-    return eqx.tree_at(lambda s: s.model, scene, scene.model.replace(**contact))
 
 
 def compiler_options() -> dict | None:

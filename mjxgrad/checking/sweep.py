@@ -68,8 +68,7 @@ def scene_task(
     model = scene.mj_model
     state = initial_state(scene) if start is None else initial_state(scene, keyframe=start)
     if start is not None:
-        key, _ = _found(model, start, "key")
-        scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.asarray(model.key_ctrl[key], state.qpos.dtype))
+        scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.asarray(model.key(start).ctrl, state.qpos.dtype))
     if cost is None:
         outcomes = _outcomes(scene, None, np.random.default_rng(seed))[1]
         cost = lambda trajectory: outcomes(trajectory)[0]  # noqa: E731
@@ -102,7 +101,7 @@ def _named_cost(scene: Scene, name: str) -> Cost:
         return load_function(name)
     if len(names := what.split("/")) != _BUILT_IN[kind]:
         raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")
-    found = [_found(scene.mj_model, name, "body", "site") for name in names]
+    found = [_body_or_site(scene.mj_model, name) for name in names]
     data, seconds = scene.data, scene.mj_model.opt.timestep
 
     def frames(qpos: Float[Array, " nq"]) -> list[tuple[Array, Array]]:
@@ -121,19 +120,15 @@ def _named_cost(scene: Scene, name: str) -> Cost:
     return cost
 
 
-def _found(model: mujoco.MjModel, name: str, *kinds: str) -> tuple[int, bool]:
-    """Return the id of a named element of one of several kinds, and whether it is of the first kind."""
-    known = {kind: _names(model, kind) for kind in kinds}
+def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
+    """Return the id of a named body or site, and whether it is a body."""
+    counts = {"body": (model.nbody, model.body), "site": (model.nsite, model.site)}
+    known = {kind: [at(i).name for i in range(count)] for kind, (count, at) in counts.items()}
     for kind, names in known.items():
         if name in names:
-            return names.index(name), kind == kinds[0]
+            return names.index(name), kind == "body"
     there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
-    raise ValueError(f"there is no {' or '.join(kinds)} {name!r} in the scene, but {there}")
-
-
-def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    number = getattr(model, {"actuator": "nu", "joint": "njnt"}.get(kind, f"n{kind}"))
-    return [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), i) or "" for i in range(number)]
+    raise ValueError(f"there is no body or site {name!r} in the scene, but {there}")
 
 
 class CommonShift(OpenLoop):
@@ -165,8 +160,7 @@ class Knob:
 
     The number shifts all controls along one direction, and every control has noise at each step; both are in halves of the
     control ranges. Without actuators both act on the initial velocities, in m/s or rad/s. The direction is random where there
-    are
-    several.
+    are several.
     """
 
     task: SceneTask
@@ -198,9 +192,9 @@ class Knob:
         return CommonShift(task, self.noise * half, dim=1, direction=half * along)  # pyright: ignore[reportCallIssue]
 
     def __str__(self) -> str:
-        kind = "actuator" if self.task.num_controls else "joint"
-        names = _names(self.task.scene.mj_model, kind)
-        which = f"{names[0] or f'the {kind}'}" if len(names) == 1 else f"all {len(names)} {kind}s in a random mix"
+        kind, model = "actuator" if self.task.num_controls else "joint", self.task.scene.mj_model
+        count, first = (model.nu, model.actuator) if kind == "actuator" else (model.njnt, model.joint)
+        which = first(0).name or f"the {kind}" if count == 1 else f"all {count} {kind}s in a random mix"
         if kind == "joint":
             return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
         return f"a constant control of {which}; noise of {self.noise:g} on it in each step, both in halves of its range"
@@ -243,10 +237,8 @@ class Sweep:
 
     def as_html(self) -> str:
         """Return the sweep as a self-contained page; needs `mjxgrad[render]`."""
-        picture, (head, *rows) = (
-            svg(self.result.plot, "Bias and variance over stiffness"),
-            self.result.rows(self.labels),
-        )
+        picture = svg(self.result.plot, "Bias and variance over stiffness")
+        head, *rows = self.result.rows(self.labels)
         told = f"Bars: {self.result.confidence:.0%} intervals. Bias in cost per unit of what is moved, variance in its square."
         blocks = [Block(text=self.question, drawings=[picture], caption=told), Block(table=Table(head, rows))]
         return page(self.headline, f"mjxgrad sweep {self.name}", [*blocks, Block(items=self.result.notes())])

@@ -34,13 +34,15 @@ from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.rules import Consistent
-from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, check_baseline, sample
-from mjxgrad.objective import Objective, ParameterNoise, flattened, of_vector
+from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, sample
+from mjxgrad.objective import Objective, ParameterNoise
 from mjxgrad.objective.base import unchanged
 from mjxgrad.scene import SceneWarning
 
 # The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
 REACH = 6.0
+# Rollouts of one α-order estimate, from which it also chooses α.
+_BATCH = 16
 # XLA keeps 1.3 of two cores busy with one such program.
 _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
@@ -68,8 +70,7 @@ class Landscape(eqx.Module):
         """Return the gradient of the smoothed cost, and its standard error.
 
         The point `params` must lie at least `REACH` standard deviations inside the landscape. The standard error errs on the
-        large
-        side. Both are NaN if a cost with weight is not finite.
+        large side. Both are NaN if a cost with weight is not finite.
 
         Args:
             params: the parameter at which the gradient is taken.
@@ -123,7 +124,7 @@ class BiasVariance(eqx.Module):
         params: the points.
         first: the first-order estimates.
         zeroth: the zeroth-order estimates, from the same rollouts.
-        alpha_order: the mean of the α-order estimates, each from one batch of `alpha_samples` of the same rollouts, with
+        alpha_order: the mean of the α-order estimates, each from one batch of 16 of the same rollouts, with
             their variance per rollout and their mean α. None for fewer than two batches, random starts, or an objective whose
             noise is unknown.
         cost: the cost without noise.
@@ -179,8 +180,7 @@ class BiasVariance(eqx.Module):
         """Return `truth` and each estimate's bias and variance, such as `first_bias`, with ends `_low` and `_high`.
 
         For several parameters these are norms, with conservative intervals (see `BiasConstrained`). `_is_biased` says where a
-        bias
-        is significant over the whole table.
+        bias is significant over the whole table.
         """
         is_one = self.params.shape[1] == 1
         found: dict[str, Any] = {"finite_share": self.first.finite_fraction}
@@ -273,17 +273,13 @@ class BiasVariance(eqx.Module):
 
 def bias_variance(
     objective_of_softness: Callable[[PyTree], Objective],
-    params: PyTree,
+    params: Float[ArrayLike, "..."],
     key: PRNGKeyArray,
     *,
-    softness: PyTree | Sequence[PyTree],
+    softness: PyTree,
     num_samples: int = 256,
     num_reference: int = 2048,
-    alpha_samples: int = 16,
-    baseline: str = "leave_one_out",
     confidence: float = 0.95,
-    num_resamples: int = 1000,
-    chunk_size: int | None = None,
     compiler_options: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BiasVariance:
@@ -295,18 +291,13 @@ def bias_variance(
 
     Args:
         objective_of_softness: function from one softness to the objective; traceable.
-        params: points to measure at, one per row, in the parameters' units; or a pytree whose floating-point arrays have a
-            leading axis of points. The result has them as vectors.
+        params: points to measure at, one per row, in the parameters' units.
         key: consumed here.
-        softness: any pytree whose leaves have a leading axis (`Softness.sweep`), or a sequence of pytrees.
+        softness: any pytree whose leaves have a leading axis (`Softness.sweep`).
         num_samples: differentiated rollouts per softness and point. At least 2.
         num_reference: rollouts for the reference. They count per softness for a single parameter with noise (one landscape
             serves all points), otherwise per softness and point. At least 4.
-        alpha_samples: rollouts of one α-order estimate, from which it also chooses α. At least 4.
-        baseline: the baseline of the zeroth-order estimate.
         confidence: coverage of the intervals.
-        num_resamples: number of bootstrap resamples.
-        chunk_size: number of rollouts at a time.
         compiler_options: options for XLA.
         progress: called after every softness with the number done and the total.
 
@@ -320,10 +311,12 @@ def bias_variance(
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
         arXiv:2202.00817, section 3 (bias) and figure 4 (variance against stiffness).
     """
-    check_baseline(baseline)
-    params, restore = _points(params)
+    if jnp.ndim(params) != 2:
+        raise ValueError(
+            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
+        )
+    params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
-    whole("alpha_samples", alpha_samples, 4)
     stacked, count = _stacked(softness)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     objective, told = _warned(objective_of_softness, each)
@@ -332,10 +325,10 @@ def bias_variance(
     wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
     is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
     # Except on a line the reference comes from more runs of the same program, which saves a compilation.
-    plan = Plan(num_samples, chunk_size, with_zero_noise=not is_line or baseline == "zero_noise", **wanted)
-    batch = alpha_samples if knows_noise and num_samples >= 2 * alpha_samples else None
+    plan = Plan(num_samples, with_zero_noise=not is_line, **wanted)
+    has_alpha = knows_noise and num_samples >= 2 * _BATCH
 
-    measure = _program(objective_of_softness, restore, plan, baseline, batch, num_reference if is_line else None)
+    measure = _program(objective_of_softness, plan, has_alpha, num_reference if is_line else None)
     # Compiled here, since a thread does not see settings made by `with`, such as the precision.
     compiled = compile_once(measure.lower(each[0], params, key), compiler_options)
 
@@ -346,7 +339,7 @@ def bias_variance(
             runs = [compiled(one, params, k)[0]["reference"] for k in others]
             measured["reference"] = sum(value for value, _ in runs) / len(runs)
             measured["reference_error"] = jnp.sqrt(sum(error**2 for _, error in runs)) / len(runs)
-        return measured, _variance_intervals(samples, batches, batch or 1, baseline, confidence, num_resamples)
+        return measured, _variance_intervals(samples, batches, confidence)
 
     rows = []
     with ThreadPoolExecutor(_WORKERS) as pool:
@@ -373,7 +366,7 @@ def bias_variance(
         bias_interval=mean_interval(bias, bias_error, count_first, confidence),
         first_variance_interval=variances[0],
         zeroth_variance_interval=variances[1],
-        alpha_order_variance_interval=None if batch is None else variances[2],
+        alpha_order_variance_interval=variances[2] if has_alpha else None,
         warnings=told,
         reference_method="landscape" if is_line else "control_variate" if knows_noise else "zeroth_order",
         confidence=confidence,
@@ -395,12 +388,7 @@ def _warned(
 
 
 def _program(
-    objective_of_softness: Callable[[PyTree], Objective],
-    restore: Callable | None,
-    plan: Plan,
-    baseline: str,
-    batch: int | None,
-    num_cells: int | None,
+    objective_of_softness: Callable[[PyTree], Objective], plan: Plan, has_alpha: bool, num_cells: int | None
 ) -> Any:
     """Return the jitted measurement at one softness: estimates, samples, and α-order estimates in batches."""
 
@@ -408,18 +396,17 @@ def _program(
     def measure(
         softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
     ) -> tuple[dict[str, Any], Samples, Array | None]:
-        objective = of_vector(objective_of_softness(softness), restore).sized_for(params[0])
+        objective = objective_of_softness(softness).sized_for(params[0])
         samples_key, reference_key = jax.random.split(key)
         by_noise = _sampled(objective, params, samples_key, plan)
         samples = jax.vmap(_by_parameters)(by_noise) if plan.by_noise else by_noise
-        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, baseline, unchanged))(samples)
+        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, "leave_one_out", unchanged))(samples)
         mixed = (None, None)
-        if batch is not None:
-            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, batch, z))(by_noise, zeroth)  # pyright: ignore[reportArgumentType]
+        if has_alpha:
+            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)
         found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
-        if num_cells is not None:
-            size = max(2, plan.chunk_size or DEFAULT_CHUNK_SIZE)
-            return found | _by_landscape(objective, params, reference_key, num_cells, size), samples, mixed[1]
+        if isinstance(objective, ParameterNoise) and num_cells is not None:
+            return found | _by_landscape(objective, params, reference_key, num_cells), samples, mixed[1]
         unbiased = jax.vmap(_unbiased)(by_noise) if plan.by_noise else (zeroth.value, zeroth.standard_error)
         found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
         return found, samples, mixed[1]
@@ -450,11 +437,11 @@ def _by_parameters(samples: Samples) -> Samples:
 
 
 def _in_batches(
-    samples: Samples, plan: Plan, size: int, zeroth: GradientEstimate
+    samples: Samples, plan: Plan, zeroth: GradientEstimate
 ) -> tuple[GradientEstimate, Float[Array, "batches dim"]]:
-    """Return the mean of the α-order estimates, one for each batch of `size` samples, and all of them."""
-    count = plan.num_samples // size
-    batches = jax.tree.map(lambda leaf: leaf[: count * size].reshape(count, size, *leaf.shape[1:]), samples)
+    """Return the mean of the α-order estimates, one for each batch of samples, and all of them."""
+    count = plan.num_samples // _BATCH
+    batches = jax.tree.map(lambda leaf: leaf[: count * _BATCH].reshape(count, _BATCH, *leaf.shape[1:]), samples)
 
     def one(batch: Samples) -> tuple[Array, Array, Array]:
         (parts,) = both_parts(batch, control_variate=True)
@@ -468,7 +455,7 @@ def _in_batches(
         zeroth,
         value=jnp.where(found.count > 1, found.mean, jnp.nan),
         standard_error=jnp.sqrt(found.squared_error()),
-        covariance_diagonal=size * found.count * found.squared_error(),
+        covariance_diagonal=_BATCH * found.count * found.squared_error(),
         num_finite=found.count,
         alpha=jnp.nanmean(jnp.where(exists, alpha, jnp.nan)),
     )
@@ -483,11 +470,7 @@ def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " di
 
 
 def _by_landscape(
-    objective: ParameterNoise,
-    params: Float[Array, "points dim"],
-    key: PRNGKeyArray,
-    num_reference: int,
-    chunk_size: int,
+    objective: ParameterNoise, params: Float[Array, "points dim"], key: PRNGKeyArray, num_reference: int
 ) -> dict[str, Any]:
     """Compute the cost and the reference from one landscape."""
     stddev = jnp.ravel(objective.stddev)[0].astype(params.dtype)
@@ -495,63 +478,32 @@ def _by_landscape(
     points, cell = cell_points(key, low, high, num_reference)
     everywhere = jnp.concatenate([points, params[:, 0]])
     # One body for the landscape and the points: compiling takes longer than running.
-    costs = map_in_chunks(lambda x: objective.function(x[None]), everywhere, chunk_size)
+    costs = map_in_chunks(lambda x: objective.function(x[None]), everywhere, DEFAULT_CHUNK_SIZE)
     landscape, cost = Landscape(points, costs[:num_reference], cell), costs[num_reference:]
     gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
     return {"cost": cost, "reference": gradient[:, None], "reference_error": error[:, None], "landscape": landscape}
 
 
 def _variance_intervals(
-    samples: Samples, batches: Array | None, size: int, baseline: str, confidence: float, num_resamples: int
+    samples: Samples, batches: Array | None, confidence: float
 ) -> Float[np.ndarray, "estimates 2 points"]:
     """Bootstrap the variance per rollout of each estimate at each point; axes: estimate, interval end, point."""
     intervals = []
     for i in range(len(samples.costs)):
-        terms = _terms(jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples), baseline)
-        terms += () if batches is None else (np.sqrt(size) * np.asarray(batches[i], float),)
-        intervals.append([bootstrap_variance_interval(x, confidence, num_resamples=num_resamples) for x in terms])
+        one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples)
+        is_noisy = one.is_noisy > 0
+        costs, scores = one.costs[is_noisy, 0], one.scores[is_noisy, 0]
+        is_finite = np.isfinite(costs)
+        # Leaving one out is replaced by the mean, equal up to 1/N.
+        centre = costs[is_finite].mean() if is_finite.any() else np.nan
+        terms = [np.where(is_finite[:, None], one.gradients[is_noisy, 0], np.nan), (costs - centre)[:, None] * scores]
+        terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
+        intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)
 
 
-def _terms(samples: Samples, baseline: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the samples of both estimates at one point; leave-one-out is replaced by the mean, equal up to 1/N."""
-    is_noisy = samples.is_noisy > 0
-    costs, scores = samples.costs[is_noisy, 0], samples.scores[is_noisy, 0]
-    finite = costs[np.isfinite(costs)]
-    centre = {
-        "leave_one_out": finite.mean() if len(finite) else np.nan,
-        "zero_noise": samples.costs[samples.is_noise_free > 0, 0].sum(),
-        "none": 0.0,
-    }[baseline]
-    gradients = np.where(np.isfinite(costs)[:, None], samples.gradients[is_noisy, 0], np.nan)
-    return gradients, (costs - centre)[:, None] * scores
-
-
-def _points(params: PyTree) -> tuple[Float[Array, "points dim"], Callable | None]:
-    """Return the points as rows, and the function from a row back to the pytree; None if they are rows already."""
-    if eqx.is_array_like(params):
-        if jnp.ndim(params) != 2:
-            raise ValueError(
-                f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
-            )
-        return jnp.asarray(params), None
-    arrays, others = eqx.partition(params, eqx.is_inexact_array)
-    first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], arrays), others)
-    return jax.vmap(lambda one: flattened(one)[0])(arrays), flattened(first)[1]
-
-
-def _stacked(softness: PyTree | Sequence[PyTree]) -> tuple[PyTree, int]:
-    """Return one pytree with a leading axis, and its length."""
-    if isinstance(softness, list | tuple):
-        if not softness:
-            raise ValueError("softness must have at least one value, got none")
-        structures = {jax.tree.structure(one) for one in softness}
-        if len(structures) > 1:
-            raise ValueError(
-                "softness must have the same parts set in every value, got "
-                f"{len(structures)} different sets; give each of them every part that any of them has"
-            )
-        softness = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *softness)
+def _stacked(softness: PyTree) -> tuple[PyTree, int]:
+    """Return a pytree of arrays with one leading axis, and its length."""
     softness = jax.tree.map(jnp.asarray, softness)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
     if len(lengths) != 1 or () in lengths or (0,) in lengths:

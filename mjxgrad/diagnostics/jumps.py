@@ -26,8 +26,6 @@ class Jumps(eqx.Module):
         after: the value just after each.
         steepest: the largest change per parameter among divided intervals without a jump; zero if there are none.
         scale: largest size of a value on the grid.
-        resolution: length of the finest intervals: a slope over less than this counts as a jump.
-        num_finite: number of grid points whose value is finite; jumps are found between such points only.
     """
 
     parameters: Float[np.ndarray, " points"]
@@ -37,8 +35,6 @@ class Jumps(eqx.Module):
     after: Float[np.ndarray, "jumps *outcome"]
     steepest: float
     scale: float
-    resolution: float
-    num_finite: int
 
     @property
     def sizes(self) -> Float[np.ndarray, " jumps"]:
@@ -75,7 +71,8 @@ def jumps_along(
 ) -> Jumps:
     """Find the jumps of a quantity along a one-parameter path.
 
-    Between two neighbouring points of the grid only the largest jump is found.
+    Between two neighbouring points of the grid only the largest jump is found, and only where both values are finite.
+    A slope over less than the finest interval counts as a jump.
 
     Args:
         function: from many parameters at once to their values, such as `jax.jit(jax.vmap(f))` or a loop over C MuJoCo. Every
@@ -90,8 +87,7 @@ def jumps_along(
         The jumps, and the grid.
 
     Raises:
-        ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` and at least that many and
-            two,
+        ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` and at least two,
             `num_refinements` is below 1, or the function does not return one value per parameter.
     """
     low, high = interval
@@ -112,7 +108,6 @@ def jumps_along(
     widths = ends[:, 1] - ends[:, 0]
     slopes = np.where(is_jump | (changes < 0), 0.0, changes / np.where(widths > 0, widths, 1.0))
     order = np.flatnonzero(is_jump)[np.argsort(ends[is_jump, 0])]
-    parts = num_points // num_candidates + 1
     return Jumps(
         parameters=grid,
         values=values,
@@ -121,8 +116,6 @@ def jumps_along(
         after=at_ends[order, 1],
         steepest=float(slopes.max(initial=0.0)),
         scale=scale,
-        resolution=(high - low) / (num_points - 1) / parts**num_refinements,
-        num_finite=int(finite.sum()),
     )
 
 

@@ -15,15 +15,11 @@ equals its mean derivative with weight $k$ for any curvature. They differ by the
 smooth weight also averages over teeth: it vanishes at the ends, where teeth are cut.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
-
-Simulate = Callable[[Float[Array, ""], str], Float[Array, "*outcome"]]
+from jaxtyping import ArrayLike, Bool, Float, Int
 
 # Fewest phases for four local slopes and eight blocks of the error bar, with four points each.
 _FEWEST_PHASES = 32
@@ -120,39 +116,6 @@ class SlopeComparison(eqx.Module):
         return np.asarray(self.slope_error <= np.maximum(tolerance * self.scale, self.resolution))
 
 
-def derivative_against_slope(
-    simulate: Simulate,
-    interval: tuple[float, float],
-    *,
-    num_phases: int = 64,
-    gradients: Sequence[str] = ("discrete", "slope"),
-) -> SlopeComparison:
-    """Compare derivatives of a simulated outcome with the slope of the outcome itself.
-
-    Args:
-        simulate: function from a parameter and the name of a gradient to the outcome, of any shape. For instance positions at
-            several times of `mg.rollout(..., contact=contacts[name])` from a start that depends on the parameter. Its value must
-            not depend on the name. It is compiled once per name and function object; a pytree (`jax.tree_util.Partial`,
-            `eqx.Module`) is reused where only its arrays differ.
-        interval: first and last parameter. Long enough that the first contact moves through ten time steps or more, and short
-            enough that the motion stays of one kind.
-        num_phases: number of simulated rollouts, evenly spread with a jitter that avoids resonance with the teeth.
-        gradients: names to hand to `simulate`. Errors of the others are measured relative to the first.
-
-    Returns:
-        Slope, means and their errors.
-
-    Raises:
-        ValueError: if the interval is empty, `num_phases` is below 32 or no gradient is named.
-    """
-    names = tuple(gradients)
-    if not names:
-        raise ValueError("gradients must name at least one derivative, got none")
-    parameters = phases(interval, num_phases)
-    sampled = [_sample(simulate, jnp.asarray(parameters), name) for name in names]
-    return compare_to_slope(parameters, sampled[0][0], [derivative for _, derivative in sampled], names)
-
-
 def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, " phases"]:
     """Return parameters spread over an interval, one at a random place in each of equal parts.
 
@@ -226,15 +189,6 @@ def compare_to_slope(
         num_finite=num_finite.astype(int),
         resolution=np.asarray(_ROUNDINGS * epsilon * size / width),
     )
-
-
-@eqx.filter_jit
-def _sample(simulate: Simulate, parameters: Float[Array, " phases"], gradient: str) -> tuple[Array, Array]:
-    def one(parameter: Float[Array, ""]) -> tuple[Array, Array]:
-        # Forward mode: one parameter, many outcomes.
-        return jax.jvp(lambda x: simulate(x, gradient), (parameter,), (jnp.ones_like(parameter),))
-
-    return jax.vmap(one)(parameters)
 
 
 def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients phases"]) -> tuple:

@@ -60,7 +60,8 @@ class Spring:
         size: largest travel in one step that is still detected: the thickness of the bodies, or the range of a limit, in m
             (rad); infinite for planes and equalities.
         num_rows: largest number of contacts of the pair at once.
-        pyramid: sliding friction μ of a pyramidal contact; None for all others.
+        pyramid: sliding friction μ of a pyramidal contact in single precision; None for all others.
+        speed: assumed speed of approach, in m/s (rad/s at limits of hinges); None for none.
     """
 
     kind: str
@@ -75,6 +76,7 @@ class Spring:
     size: float
     num_rows: int = 1
     pyramid: float | None = None
+    speed: float | None = None
 
     def __str__(self) -> str:
         return self.name
@@ -139,6 +141,12 @@ class Spring:
         return self.width / (speed * self.timestep) if first != last and speed > 0 else np.inf
 
     @property
+    def _written(self) -> tuple[str, str]:
+        """The speed, and the depth beyond which a bounce passes through, as text; a limit has its joint's unit."""
+        is_length = self.kind == "contact"
+        return format_number(self.speed or 0.0) + " m/s" * is_length, f"{self.size:.3g}" + " m" * is_length
+
+    @property
     def _bounce(self) -> Bounce:
         # Bounce writes ω₀ = 1 / (t_c ζ), which is √k by the definitions above.
         return Bounce(self.time_constant, self.damping_ratio)
@@ -154,7 +162,6 @@ class StabilityReport:
         timestep: time step, in s.
         speed: assumed speed of approach, in m/s, or None.
         joint_speed: assumed speed of joints and tendons, in rad/s or m/s, or None.
-        precision: "float32" or "float64".
     """
 
     name: str
@@ -162,7 +169,6 @@ class StabilityReport:
     timestep: float
     speed: float | None = None
     joint_speed: float | None = None
-    precision: str = "float64"
 
     @property
     def is_stable(self) -> bool:
@@ -172,8 +178,7 @@ class StabilityReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence per finding, shared by equal springs; empty if the time step resolves every spring."""
-        rules = (_hidden, _unstable, _unstable_together, _short)
-        rules += (self._passed, self._deep, self._unresolved, self._steep)
+        rules = (_hidden, _unstable, _unstable_together, _short, _passed, _deep, _unresolved, _steep)
         found: dict[tuple[str, str], list[Spring]] = {}
         for spring in self.springs:
             for text in filter(None, (rule(spring) for rule in rules)):
@@ -222,71 +227,59 @@ class StabilityReport:
         )
         if len(self._columns) == len(_COLUMNS):
             return cells
-        speed = self._speed_of(spring)
-        if speed is None:
+        if spring.speed is None:
             return (*cells, "", "")
         unit, scale = ("mm", 1e3) if spring.kind == "contact" else ("", 1.0)
-        depth = f"{format_number(scale * spring.depth(speed))} {unit}".strip()
-        return (*cells, depth, format_number(spring.rise_steps(speed)))
+        depth = f"{format_number(scale * spring.depth(spring.speed))} {unit}".strip()
+        return (*cells, depth, format_number(spring.rise_steps(spring.speed)))
 
-    def _speed_of(self, spring: Spring) -> float | None:
-        if spring.kind == "equality":
-            return None
-        return self.speed if spring.kind == "contact" else self.joint_speed
 
-    @staticmethod
-    def _written(spring: Spring, speed: float) -> tuple[str, str]:
-        """Return a speed and the depth beyond which a bounce passes through, as text; a joint limit has the joint's unit."""
-        is_length = spring.kind == "contact"
-        return format_number(speed) + " m/s" * is_length, f"{spring.size:.3g}" + " m" * is_length
+def _passed(spring: Spring) -> str | None:
+    if spring.speed is None or spring.speed * spring.timestep < spring.size:
+        return None
+    at, size = spring._written
+    return (
+        f"at {at} the bodies move {spring.speed * spring.timestep:.3g} in one step, more than the {size} within "
+        f"which they are found, and can pass through; use a time step below {spring.size / spring.speed:.2g} s"
+    )
 
-    def _passed(self, spring: Spring) -> str | None:
-        speed = self._speed_of(spring)
-        if speed is None or speed * self.timestep < spring.size:
-            return None
-        at, size = self._written(spring, speed)
-        return (
-            f"at {at} the bodies move {speed * self.timestep:.3g} in one step, more than the {size} within "
-            f"which they are found, and can pass through; use a time step below {spring.size / speed:.2g} s"
-        )
 
-    def _deep(self, spring: Spring) -> str | None:
-        speed = self._speed_of(spring)
-        if speed is None or spring.depth(speed) < spring.size or speed * self.timestep >= spring.size:
-            return None
-        # At a fixed damping ratio the depth is proportional to stiffness^(-1/2).
-        needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
-        at, size = self._written(spring, speed)
-        return (
-            f"at {at} a bounce goes {spring.depth(speed):.3g} deep, more than the {size} from which bodies "
-            f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
-        )
+def _deep(spring: Spring) -> str | None:
+    speed = spring.speed
+    if speed is None or spring.depth(speed) < spring.size or speed * spring.timestep >= spring.size:
+        return None
+    # At a fixed damping ratio the depth is proportional to stiffness^(-1/2).
+    needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
+    at, size = spring._written
+    return (
+        f"at {at} a bounce goes {spring.depth(speed):.3g} deep, more than the {size} from which bodies "
+        f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
+    )
 
-    def _steep(self, spring: Spring) -> str | None:
-        if self.precision == "float64" or spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:
-            return None
-        return (
-            f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does not "
-            f'resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
-        )
 
-    def _unresolved(self, spring: Spring) -> str | None:
-        speed = self._speed_of(spring)
-        if speed is None:
-            return None
-        steps, jump = spring.rise_steps(speed), spring.impedance[0]
-        reasons = [f"begins with a jump, at an impedance of {jump:.3g}"] * (jump > LARGEST_JUMP)
-        if steps < STEPS_NEEDED:
-            reasons.append(f"rises within {steps:.2g} time steps")
-        if not reasons:
-            return None
-        at, _ = self._written(spring, speed)
-        unit = " m" if spring.kind == "contact" else ""
-        return (
-            f"at {at} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-            "contact=mg.Slope(), as tasks do by default, or an impedance from 0 over a width of at least "
-            f"{STEPS_NEEDED * speed * self.timestep:.2g}{unit}"
-        )
+def _steep(spring: Spring) -> str | None:
+    if spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:
+        return None
+    return (
+        f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does not "
+        f'resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
+    )
+
+
+def _unresolved(spring: Spring) -> str | None:
+    if spring.speed is None:
+        return None
+    steps, jump = spring.rise_steps(spring.speed), spring.impedance[0]
+    reasons = [f"begins with a jump, at an impedance of {jump:.3g}"] * (jump > LARGEST_JUMP)
+    reasons += [f"rises within {steps:.2g} time steps"] * (steps < STEPS_NEEDED)
+    if not reasons:
+        return None
+    unit = " m" if spring.kind == "contact" else ""
+    return (
+        f"at {spring._written[0]} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
+        "contact=mg.Slope(), as tasks do by default, or an impedance from 0 over a width of at least "
+        f"{STEPS_NEEDED * spring.speed * spring.timestep:.2g}{unit}"
+    )
 
 
 def _hidden(spring: Spring) -> str | None:
@@ -357,13 +350,11 @@ def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: fl
         raise ValueError("check_stability needs one scene with known values, got a batched or traced one")
     # Inside jit, even operations on known values would be traced.
     with jax.ensure_compile_time_eval():
-        springs = (*_contacts(scene), *_others(scene))
-    return StabilityReport(
-        scene.name, springs, float(model.opt.timestep), speed, joint_speed, str(scene.data.qpos.dtype)
-    )
+        springs = (*_contacts(scene, speed), *_others(scene, joint_speed))
+    return StabilityReport(scene.name, springs, float(model.opt.timestep), speed, joint_speed)
 
 
-def _contacts(scene: Scene) -> Iterator[Spring]:
+def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
     if not scene.pairs:
         return
     parameters = scene.contact_parameters()
@@ -374,7 +365,7 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
     for i, pair in enumerate(scene.pairs):
         kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
         springiness = (stiffness[i], damping[i], solref[i], impedance[i], width[i])
-        has_edges = is_pyramidal and pair.condim > 1
+        has_edges = is_pyramidal and pair.condim > 1 and scene.data.qpos.dtype == np.float32
         yield _spring(
             scene,
             "contact",
@@ -383,10 +374,11 @@ def _contacts(scene: Scene) -> Iterator[Spring]:
             size=_thickness(scene, pair),
             num_rows=COLLISION_FUNCTIONS[kinds].ncon,
             pyramid=float(friction[i]) if has_edges else None,
+            speed=speed,
         )
 
 
-def _others(scene: Scene) -> Iterator[Spring]:
+def _others(scene: Scene, speed: float | None) -> Iterator[Spring]:
     """Return the active joint limits, tendon limits and equalities."""
     m, c, flag, of = scene.model, scene.mj_model, mujoco.mjtDisableBit, mujoco.mjtObj
     disabled = int(m.opt.disableflags)
@@ -409,7 +401,7 @@ def _others(scene: Scene) -> Iterator[Spring]:
             size = np.inf if ranges is None else float(np.ptp(np.asarray(ranges[i], float)))
             impedance = np.clip(np.asarray(solimp[i, :2], float), mujoco.mjMINIMP, mujoco.mjMAXIMP)
             springiness = (stiffness[i], damping[i], np.asarray(solref[i], float), impedance, solimp[i, 2])
-            yield _spring(scene, kind, name, *springiness, size=size)
+            yield _spring(scene, kind, name, *springiness, size=size, speed=None if kind == "equality" else speed)
 
 
 def _spring(

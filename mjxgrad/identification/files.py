@@ -5,15 +5,13 @@ import dataclasses
 import difflib
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
 
 from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
@@ -27,9 +25,9 @@ from mjxgrad.identification.parameters import (
     mass,
     softness,
 )
-from mjxgrad.identification.recording import Recording, Windows
-from mjxgrad.rollouts import initial_state, rollout
-from mjxgrad.scene import Scene, sensor
+from mjxgrad.identification.recording import Recording
+from mjxgrad.rollouts import initial_state
+from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
 _Object = mujoco.mjtObj
@@ -82,49 +80,13 @@ def parameter(scene: Scene, text: str) -> Parameter:
     return _ALONE[kind](scene, *names, **({} if bounds is None else {"bounds": bounds}))
 
 
-def parameters(scene: Scene, given: Iterable[str]) -> dict[str, Parameter]:
-    """Return parameters by name, from texts as in `parameter` or YAML of `mujoco.sysid` and `Identification.save`.
-
-    Names in YAML are texts as in `parameter`, without bounds. Frozen ones are left out; the search begins at their values.
-
-    Raises:
-        ValueError: as `parameter`, or if a file is no such YAML.
-        ImportError: if there is YAML, and PyYAML is not installed.
-    """
-    found: dict[str, Parameter] = {}
-    for text in given:
-        if not text.endswith((".yaml", ".yml")):
-            found[text.partition("=")[0]] = parameter(scene, text)
-            continue
-        try:
-            import yaml
-        except ImportError as error:
-            raise ImportError(
-                "parameters in YAML need PyYAML, not installed: pip install 'mjxgrad[identify]'"
-            ) from error
-        try:
-            table = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
-            rows = {n: [np.ravel(row[k]) for k in ("value", "min_value", "max_value")] for n, row in table.items()}
-            frozen = {name for name, row in table.items() if row.get("frozen")}
-        except (yaml.YAMLError, AttributeError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{text} must be YAML as mujoco.sysid's ParameterDict.save_to_disk writes it: {error}"
-            ) from error
-        for name in rows.keys() - frozen:
-            made = parameter(scene, name)
-            value, low, high = (np.asarray(part, float).reshape(made.nominal.shape) for part in rows[name])
-            found[name] = Parameter(value, low, high, made.write, made.unit)
-    return found
-
-
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
     """Return a recorded motion, and the names of the columns that do not belong to the scene.
 
     Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
     `act:actuator`, readings `sensor:name`. The kind may be left out for a unique name: a joint is then its position, an
     actuator its control. An element with several numbers takes an index, `qpos:root[0]`, or `qpos[7]` in the whole array. An
-    NPZ
-    has the same names. Each array has one row per time, with one number or all of the element's numbers.
+    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers.
 
     Each signal is weighed by its variation. The motion begins at its first row; missing parts are the scene's pose, at rest.
 
@@ -251,10 +213,7 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
         for move, row in zip(moves, np.where(np.isfinite(value), value, first), strict=True):
             mujoco.mj_differentiatePos(model, move, 1.0, first, row)
         value = moves
-    known = np.isfinite(value)
-    count = np.maximum(known.sum(axis=0), 1)
-    mean = np.where(known, value, 0).sum(axis=0) / count
-    size = np.sqrt((np.where(known, value - mean, 0) ** 2).sum(axis=0) / count)
+    size = np.ma.masked_invalid(value).std(axis=0).filled(0.0)
     return np.maximum(size, _SMALLEST_SIZE * size.max(initial=0.0)) if size.any() else np.ones_like(size)
 
 
@@ -340,20 +299,3 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
         there = Path(source).parent / (getattr(spec, folder) or "")
         setattr(spec, folder, os.path.relpath(there, Path(path).parent))
     Path(path).write_text(spec.to_xml(), encoding="utf-8")
-
-
-def simulated(scene: Scene, windows: Windows, delay: Float[Array, ""] | float) -> dict[str, Array]:
-    """Return all signals of a simulation at the scene's own steps, and the positions as `qpos`; traceable.
-
-    Args:
-        scene: the scene with the identified parameters.
-        windows: one recording, as `stack` returns it.
-        delay: delay of the controls beyond the recorded times (s).
-    """
-    names = [name for name in windows.measured if name not in ("qpos", "qvel", "act")]
-    (controls,), state = windows.controls, jax.tree.map(lambda leaf: leaf[0], windows.state)
-    at = jnp.arange(len(controls), dtype=controls.dtype)
-    late = jax.vmap(lambda u: jnp.interp(at - delay / scene.model.opt.timestep, at, u), 1, 1)(controls)
-    observe = lambda m, d: {name: sensor(m, d, name) for name in names}  # noqa: E731
-    course = rollout(scene, state, late, checkpoint=False, observe=observe)
-    return {"qpos": course.qpos, "qvel": course.qvel, "act": course.act} | dict(course.observations or {})

@@ -19,6 +19,7 @@ References:
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
@@ -99,20 +100,5 @@ def body_fields(pseudo: Float[Array, "4 4"]) -> dict[str, Float[Array, "..."]]:
     separation = jnp.sqrt(jnp.finfo(spread.dtype).eps) * jnp.trace(spread)
     along, axes = jnp.linalg.eigh(spread + separation * jnp.diag(jnp.arange(3.0)))
     axes = axes * jnp.sign(jnp.linalg.det(axes))
-    moments = jnp.sum(along) - along
-    return {"body_mass": mass, "body_ipos": centre, "body_inertia": moments, "body_iquat": _quaternion(axes)}
-
-
-def _quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """Return the quaternion of a rotation: the row of $4 q q^T$ with the largest diagonal, normalised."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    products = jnp.array(
-        [
-            [1 + a + e + i, h - f, c - g, d - b],
-            [h - f, 1 + a - e - i, b + d, c + g],
-            [c - g, b + d, 1 - a + e - i, f + h],
-            [d - b, c + g, f + h, 1 - a - e + i],
-        ]
-    )
-    row = products[jnp.argmax(jnp.diag(products))]
-    return row / jnp.sqrt(jnp.sum(row * row))
+    moments, turn = jnp.sum(along) - along, Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    return {"body_mass": mass, "body_ipos": centre, "body_inertia": moments, "body_iquat": turn}

@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import ArrayLike
 
 from mjxgrad.identification import Identification, Recording, Stopped
-from mjxgrad.identification.files import simulated
-from mjxgrad.identification.recording import stack
+from mjxgrad.identification.recording import simulated, stack
 from mjxgrad.report import INK, Block, Table, page, svg
 from mjxgrad.rollouts import render
 from mjxgrad.scene import Scene
@@ -73,21 +73,16 @@ class Identified:
         lower, upper = (
             result.coordinates.unravel(np.asarray(x)) for x in (result.coordinates.lower, result.coordinates.upper)
         )
+        parts = {"value": result.values, "half_width_95": result.half_width, "start": result.start}
+        parts |= {"lower": lower, "upper": upper}
         table = {
             "scene": self.name,
             "headline": self.headline,
             "parameters": {
-                name: {
-                    "value": _plain(value),
-                    "half_width_95": _plain(result.half_width[name]),
-                    "start": _plain(result.start[name]),
-                    "lower": _plain(lower[name]),
-                    "upper": _plain(upper[name]),
-                    "unit": result.units.get(name, ""),
-                }
-                for name, value in result.values.items()
+                name: {key: _plain(part[name]) for key, part in parts.items()} | {"unit": result.units.get(name, "")}
+                for name in result.values
             },
-            "condition_number": _plain(np.asarray(result.condition_number)),
+            "condition_number": _plain(result.condition_number),
             "without_effect": result.without_effect,
             "inseparable": result.inseparable,
             "at_bounds": result.at_bounds,
@@ -117,8 +112,8 @@ class Identified:
 
     @functools.cached_property
     def _courses(self) -> tuple[dict[str, np.ndarray], ...]:
-        windows, found = stack(self.scene, [self._shown]), self.result
-        run = jax.jit(lambda scene, delay: simulated(scene, windows, delay))
+        window, found = jax.tree.map(lambda leaf: leaf[0], stack(self.scene, [self._shown])), self.result
+        run = jax.jit(lambda scene, delay: simulated(scene, window, None, delay)[0])
         courses = [run(s, v.get("delay", 0.0)) for s, v in ((self.scene, found.start), (found.scene, found.values))]
         return tuple(jax.tree.map(np.asarray, course) for course in courses)
 
@@ -214,8 +209,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
-def _plain(value: np.ndarray) -> float | list | None:
+def _plain(value: ArrayLike) -> float | list | None:
     """Return numbers for JSON; null where not finite."""
-    made = np.where(np.isfinite(value), value, np.nan).astype(object)
-    made = np.array([None if x != x else float(x) for x in np.ravel(made)], object).reshape(np.shape(value))
-    return made.tolist()
+    if np.ndim(value):
+        return [_plain(one) for one in np.asarray(value)]
+    return float(value) if np.isfinite(value) else None  # pyright: ignore[reportArgumentType]

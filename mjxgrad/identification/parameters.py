@@ -18,7 +18,6 @@ from mjxgrad.stepping.rows import index_of
 
 Write = Callable[[mjx.Model, Array], dict[str, Array]]
 """Function from a model and the parameter's value to the changed fields of the model."""
-Values = dict[str, Array]
 _Object = mujoco.mjtObj
 _FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
 _AT_BOUND = 1e-6  # share of the range
@@ -33,7 +32,7 @@ class Parameter:
         lower: least value; minus infinity for none.
         upper: greatest value; infinity for none.
         write: function from a model and a value to the changed fields, `{"dof_damping": ...}`. Derived fields follow, as in
-            `scene.with_model`. None for a parameter that only `apply` or `delay` of `identify` read.
+            `scene.with_model`. None for a parameter that only `delay` of `identify` reads.
         unit: the unit in reports.
     """
 

@@ -98,18 +98,11 @@ class Recording:
         windows = []
         for begin in begins:
             rows = np.flatnonzero((times >= begin - timestep / 2) & (times <= begin + duration + timestep / 2))
-            later = {} if controls is None else {"controls": controls, "control_times": at - times[rows[0]]}
-            if controls is not None:
-                kept = later["control_times"] > -timestep / 2
-                later = {
-                    "controls": np.asarray(controls)[kept],
-                    "control_times": np.maximum(later["control_times"][kept], 0),
-                }
             measured = {name: value[rows] for name, value in self.measured.items()}
-            name = f"{self.name} from {times[rows[0]]:g} s"
-            windows.append(
-                Recording(measured, times=times[rows] - times[rows[0]], noise=self.noise, name=name, **later)
-            )
+            start, name = times[rows[0]], f"{self.name} from {times[rows[0]]:g} s"
+            kept = np.zeros(0, bool) if at is None else at - start > -timestep / 2
+            given = (None, None) if at is None else (np.asarray(controls)[kept], np.maximum(at[kept] - start, 0))
+            windows.append(Recording(measured, given[0], times[rows] - start, given[1], self.noise, name=name))
         return windows
 
 
@@ -234,22 +227,17 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
     return np.pad(controls[:num_steps], ((0, max(0, num_steps - len(controls))), (0, 0)), mode="edge")
 
 
-def residuals(
-    scene: Scene,
-    window: Windows,
-    offset: Float[Array, " both"] | None,
-    delay: Float[Array, ""] | None,
-    *,
-    contact: Contact,
-) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
-    """Return the simulated less the measured signals of one window, in units of the noise, and whether the motion diverged.
+def simulated(
+    scene: Scene, window: Windows, offset: Float[Array, " both"] | None, delay: Float[Array, ""] | None, **settings: Any
+) -> tuple[dict[str, Array], Bool[Array, ""]]:
+    """Return all signals of a simulation by name, at the scene's own steps, and whether the motion diverged; traceable.
 
     Args:
         scene: the scene with the present parameters.
         window: one window, without the leading axis.
         offset: change of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
         delay: delay of the controls beyond the recorded times (s); None for none.
-        contact: as in `rollout`.
+        **settings: as in `rollout`.
     """
     model, state, controls = scene.model, window.state, window.controls
     if offset is not None:
@@ -263,16 +251,35 @@ def residuals(
     def observe(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
         return {name: sensor(model, data, name) for name in sensors}
 
-    look = observe if sensors else None
-    course = rollout(scene, state, controls, checkpoint=False, contact=contact, observe=look)
-    found = {name: getattr(course, name) for name in _STATES} | (course.observations or {})
+    course = rollout(scene, state, controls, checkpoint=False, observe=observe if sensors else None, **settings)
+    return {name: getattr(course, name) for name in _STATES} | (course.observations or {}), course.diverged
+
+
+def residuals(
+    scene: Scene,
+    window: Windows,
+    offset: Float[Array, " both"] | None,
+    delay: Float[Array, ""] | None,
+    *,
+    contact: Contact,
+) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
+    """Return the simulated less the measured signals of one window, in units of the noise, and whether the motion diverged.
+
+    Args:
+        scene: the scene with the present parameters.
+        window: one window, without the leading axis.
+        offset: as in `simulated`.
+        delay: as in `simulated`.
+        contact: as in `rollout`.
+    """
+    found, diverged = simulated(scene, window, offset, delay, contact=contact)
     parts = []
     for name, measured in window.measured.items():
         before, after = found[name][window.index], found[name][window.index + 1]
-        simulated = before + window.share[:, None] * (after - before)
-        is_pose = name == "qpos"
-        change = (
-            jax.vmap(position_change, (None, 0, 0))(model, measured, simulated) if is_pose else simulated - measured
-        )
+        change = before + window.share[:, None] * (after - before)
+        if name == "qpos":
+            change = jax.vmap(position_change, (None, 0, 0))(scene.model, measured, change)
+        else:
+            change -= measured
         parts.append((change * window.weight[name]).ravel())
-    return jnp.concatenate(parts), course.diverged
+    return jnp.concatenate(parts), diverged

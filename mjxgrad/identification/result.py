@@ -159,7 +159,7 @@ class Identification:
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the motion of the "
                 "scene is not the recorded one, and values may be off by more than their intervals. Try free_start=True, shorter "
-                "windows (recording.cut), more parameters or num_points, or correct the stated noise."
+                "windows (recording.cut) or more parameters, or correct the stated noise."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "

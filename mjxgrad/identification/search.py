@@ -6,12 +6,11 @@ this program for residuals and derivative at one point. From their linear model 
 chooses the next.
 """
 
-import dataclasses
 import functools
 import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._programs import compile_once
-from mjxgrad.identification.parameters import Coordinates, Parameter, Values, write_all
+from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
@@ -28,7 +27,6 @@ from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
-Apply = Callable[[Scene, Values], Scene]
 Log = Callable[[int, dict[str, float]], None]
 _MOST_REFUSALS = 12  # in a row, which shorten a step by a factor of ten million
 _STALLED = 1e-2  # share of the sum of squares that the linear model would remove at the end
@@ -38,26 +36,10 @@ _FIRST_SIZE = 3.0  # with less, the first step may go too far to recover
 _GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix's 0.99 keeps it too long
 # Least gain as a share of the noise variance, and steps in a row below it: badly determined parameters make it creep.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
+_NUM_POINTS = 256  # of the search between the bounds
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
 _DIVERGED = 1e30  # sum of squares of a diverged motion
 _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
-
-
-@dataclasses.dataclass(frozen=True)
-class Experiment:
-    """Motions of one scene.
-
-    Attributes:
-        scene: the scene with nominal values.
-        recordings: the recordings to fit.
-        held_out: the held-out recordings.
-        apply: function from the scene and the vector of all parameters to the changed scene.
-    """
-
-    scene: Scene
-    recordings: Sequence[Recording]
-    held_out: Sequence[Recording]
-    apply: Callable[[Scene, Array], Scene]
 
 
 def identify(
@@ -66,19 +48,18 @@ def identify(
     recordings: Sequence[Any],
     *,
     held_out: Sequence[Any] = (),
-    apply: Apply | None = None,
     delay: str | None = None,
     free_start: bool = False,
     contact: Contact = Discrete(),
     max_steps: int = 100,
-    num_points: int = 256,
     log: Log | None = None,
 ) -> Identification:
     r"""Identify parameters of a scene from recorded motions, through contact.
 
     Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
-    derivatives
-    through the simulation. Needs optimistix (`pip install 'mjxgrad[identify]'`).
+    derivatives through the simulation. Where it leaves more than the stated noise, as where contacts chatter, a second
+    descent begins at the best of many points between the bounds; not with `free_start`. Needs optimistix
+    (`pip install 'mjxgrad[identify]'`).
 
     Args:
         scene: the scene with nominal values; or several scenes that share the parameters.
@@ -86,16 +67,11 @@ def identify(
             own `write`.
         recordings: recordings of the scene; for several scenes, a sequence for each of them.
         held_out: recordings for validation only, in the same form.
-        apply: called as `apply(scene, values)` after the parameters have written theirs, for changes that need several of
-            them.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
         contact: as in `rollout`. The default is MuJoCo's motion, which recordings by MuJoCo need: the intervals do not cover
             the error of another motion. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of simulations with derivatives.
-        num_points: number of points of a global search between the bounds. It runs where the descent leaves more than the
-            stated noise, as where contacts chatter; a second descent begins at the best point. 0 for no such search; there is
-            none with `free_start`.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
     Returns:
@@ -115,79 +91,78 @@ def identify(
         )
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
-    coordinates = Coordinates.of(parameters)
-
-    def put(scene: Scene, vector: Array) -> Scene:
-        values = coordinates.unravel(vector)
-        changed = write_all(scene, parameters, values)
-        return changed if apply is None else apply(changed, values)
-
-    experiments = [Experiment(*parts, put) for parts in zip(scenes, groups, others, strict=True)]
-    settings = {"delay": delay, "free_start": free_start, "contact": contact}
-    units = {name: parameter.unit for name, parameter in parameters.items()}
-    return search(experiments, coordinates, units, max_steps=max_steps, num_points=num_points, log=log, **settings)
-
-
-def search(
-    experiments: Sequence[Experiment],
-    coordinates: Coordinates,
-    units: dict[str, str],
-    *,
-    max_steps: int,
-    log: Log | None,
-    num_points: int = 0,
-    free_start: bool,
-    **settings: Any,
-) -> Identification:
-    """Run the search over experiments of any kind; see `identify`."""
     if max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     try:  # before anything is compiled
         importlib.import_module("optimistix")
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
-    program = _Program(experiments, coordinates, free_start, **settings)
+    settings = {"delay": delay, "free_start": free_start, "contact": contact}
+    program = _Program(scenes, groups, parameters, **settings)
     start = program.start()
-    point, found, num_steps, ended, first, removable = _descend(program, start, max_steps, log)
-    has_noise = all(set(one.noise) == set(one.measured) for each in experiments for one in each.recordings)
-    numbers = program.num_numbers
-    if num_points and has_noise and not free_start and exceeds_noise(_rms(program, found), numbers - len(start)):
-        begin = program.searched(num_points)
+    end = _descend(program, start, max_steps, log)
+    has_noise = all(set(one.noise) == set(one.measured) for group in groups for one in group)
+    if has_noise and not free_start and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
+        begin = program.searched()
         again = None if begin is None else _descend(program, begin, max_steps, log)
-        if again is not None and _rms(program, again[1]) < _rms(program, found):
-            point, found, more, ended, _, removable = again
-            num_steps += more
-    values = np.asarray(coordinates.values(point[: len(coordinates.names)]), float)
-    explained = on_host(found)
+        if again is not None and _rms(program, again.found) < _rms(program, end.found):
+            end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
+    return _identified(program, end, others, has_noise)
+
+
+class _End(NamedTuple):
+    """The end of a descent.
+
+    Attributes:
+        point: the best point.
+        found: residuals and their derivatives there.
+        num_steps: number of steps.
+        has_ended: whether the search ended before the largest number of steps.
+        first: root mean square of the residuals at the start.
+        removable: share of the sum of squares that the linear model would still remove.
+    """
+
+    point: Array
+    found: list[tuple[Array, ...]]
+    num_steps: int
+    has_ended: bool
+    first: float
+    removable: float
+
+
+def _identified(
+    program: "_Program", end: _End, held_out: Sequence[Sequence[Recording]], has_noise: bool
+) -> Identification:
+    """Return the values at the end of a search, with all that the recordings tell of them."""
+    coordinates, numbers = program.coordinates, program.num_numbers
+    values = np.asarray(coordinates.values(end.point[: len(coordinates.names)]), float)
+    explained = on_host(end.found)
     residual, slope, num_offsets = _without_offsets(explained)
-    verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
-    after, before = np.linalg.norm(residual), first * np.sqrt(numbers)
-    rounding = _VANISHED * float(jnp.finfo(point.dtype).eps)
-    stalls = removable > _STALLED and after > max(rounding, 1e-6) * before
+    verdict: dict[str, Any] = vars(statistics(coordinates, values, residual, slope, numbers, num_offsets)).copy()
+    verdict["half_width"] = coordinates.unravel(verdict["half_width"])
+    after, before = np.linalg.norm(residual), end.first * np.sqrt(numbers)
+    rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
+    stalls = end.removable > _STALLED and after > max(rounding, 1e-6) * before
     nominal = np.asarray(coordinates.nominal, float)
     is_at_bound = np.logical_or(*coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype)))
     return Identification(
+        **verdict,
         values=coordinates.unravel(values),
         start=coordinates.unravel(nominal),
-        half_width=coordinates.unravel(verdict.half_width),
-        covariance=verdict.covariance,
         names=coordinates.names,
-        condition_number=verdict.condition_number,
-        without_effect=verdict.without_effect,
-        inseparable=verdict.inseparable,
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
-        rms=(first, float(after / np.sqrt(numbers))),
+        rms=(end.first, float(after / np.sqrt(numbers))),
         has_noise=has_noise,
-        held_out_rms=program.held_out_rms(nominal, values),
-        offsets=tuple(np.asarray(x) for x in program.offsets(point)) if free_start else None,
+        held_out_rms=program.held_out_rms(held_out, nominal, values),
+        offsets=tuple(np.asarray(x) for x in program.offsets(end.point)) if program.free_start else None,
         correlation=_correlation(program.windows, explained),
-        removable=removable,
+        removable=end.removable,
         num_numbers=numbers,
-        num_steps=num_steps,
-        stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if ended else Stopped.STEPS,
+        num_steps=end.num_steps,
+        stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if end.has_ended else Stopped.STEPS,
         scenes=program.scenes(values),
         coordinates=coordinates,
-        units=units,
+        units={name: parameter.unit for name, parameter in program.parameters.items()},
     )
 
 
@@ -195,11 +170,18 @@ class _Program:
     """Residuals and their derivatives by values and offsets. Measurements are arguments, so other data compile nothing."""
 
     def __init__(
-        self, experiments: Sequence[Experiment], coordinates: Coordinates, free_start: bool, *, delay, **settings
+        self,
+        scenes: Sequence[Scene],
+        recordings: Sequence[Sequence[Recording]],
+        parameters: Mapping[str, Parameter],
+        *,
+        free_start: bool,
+        delay: str | None,
+        **settings: Any,
     ):
-        self.experiments, self.coordinates, self.free_start = experiments, coordinates, free_start
-        self._delay, self._settings = delay, settings
-        self.windows = [stack(one.scene, one.recordings) for one in experiments]
+        self.nominal, self.parameters, self.coordinates = scenes, parameters, Coordinates.of(parameters)
+        self.free_start, self._delay, self._settings = free_start, delay, settings
+        self.windows = [stack(*one) for one in zip(scenes, recordings, strict=True)]
         self.num_numbers = _num_numbers(self.windows)
         if not self.num_numbers:
             raise ValueError("recordings must hold something that was measured, got NaN alone")
@@ -210,19 +192,22 @@ class _Program:
             self._compiled[function] = compile_once(jax.jit(function).lower(*arguments))
         return self._compiled[function](*arguments)
 
-    def _residuals(self, experiment: Experiment, vector: Array, offset: Array | None, window: Windows) -> Array:
-        scene = experiment.apply(experiment.scene, vector)
+    def _put(self, scene: Scene, vector: Array) -> Scene:
+        return write_all(scene, self.parameters, self.coordinates.unravel(vector))
+
+    def _residuals(self, scene: Scene, vector: Array, offset: Array | None, window: Windows) -> Array:
+        scene = self._put(scene, vector)
         delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
         residual, diverged = residuals(scene, window, offset, delay, **self._settings)
         return jnp.where(diverged, jnp.inf, residual)
 
     def _traced(self, of_all: list[Windows], vector: Array, offsets: list[Array]) -> list[tuple[Array, ...]]:
         found = []
-        for i, experiment in enumerate(self.experiments):
+        for i, scene in enumerate(self.nominal):
 
-            def one(window: Windows, offset: Array | None, experiment=experiment):
+            def one(window: Windows, offset: Array | None, scene=scene):
                 def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
-                    residual = self._residuals(experiment, vector, offset, window)
+                    residual = self._residuals(scene, vector, offset, window)
                     return residual, residual
 
                 argnums = (0, 1) if self.free_start else (0,)
@@ -234,17 +219,17 @@ class _Program:
 
     def _sums(self, of_all: list[Windows | None], vectors: Array) -> Float[Array, "points rows"]:
         """Return for each vector the sum of squares over all windows, cumulative over their rows."""
-        there = [(e, w) for e, w in zip(self.experiments, of_all, strict=True) if w is not None]
+        there = [(s, w) for s, w in zip(self.nominal, of_all, strict=True) if w is not None]
         num_rows = max(windows.index.shape[1] for _, windows in there)
 
-        def of_window(experiment: Experiment, vector: Array, window: Windows) -> Array:
-            squares = self._residuals(experiment, vector, None, window) ** 2
+        def of_window(scene: Scene, vector: Array, window: Windows) -> Array:
+            squares = self._residuals(scene, vector, None, window) ** 2
             ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
             of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
             return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
 
         def of_one(vector: Array) -> Array:
-            parts = [jax.vmap(functools.partial(of_window, e, vector))(w).sum(axis=0) for e, w in there]
+            parts = [jax.vmap(functools.partial(of_window, s, vector))(w).sum(axis=0) for s, w in there]
             return jnp.cumsum(sum(parts))
 
         return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
@@ -255,7 +240,7 @@ class _Program:
 
     def start(self) -> Array:
         """Return the point of the nominal values, without offsets: zero."""
-        sizes = [len(w.controls) * 2 * e.scene.model.nv for w, e in zip(self.windows, self.experiments, strict=True)]
+        sizes = [len(w.controls) * 2 * s.model.nv for w, s in zip(self.windows, self.nominal, strict=True)]
         return jnp.zeros(
             len(self.coordinates.names) + (sum(sizes) if self.free_start else 0), self.coordinates.nominal.dtype
         )
@@ -266,7 +251,7 @@ class _Program:
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
-    def searched(self, num_points: int) -> Array | None:
+    def searched(self) -> Array | None:
         """Return the best of many points between the bounds, by `particles`; None if none explains the recordings."""
         dtype = self.coordinates.nominal.dtype
         weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
@@ -280,34 +265,32 @@ class _Program:
             found = np.asarray(self._run(self._sums, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
-        best = best_point(sums_at, low, high, np.cumsum(counts), num_points)
+        best = best_point(sums_at, low, high, np.cumsum(counts), _NUM_POINTS)
         return None if best is None else jnp.asarray(best, dtype)
 
     def offsets(self, point: Array) -> list[Array]:
-        """Return the offsets of the starts in a point, one array per experiment."""
+        """Return the offsets of the starts in a point, one array per scene."""
         found, first = [], len(self.coordinates.names)
-        for windows, experiment in zip(self.windows, self.experiments, strict=True) if self.free_start else ():
-            shape = (len(windows.controls), 2 * experiment.scene.model.nv)
+        for windows, scene in zip(self.windows, self.nominal, strict=True) if self.free_start else ():
+            shape = (len(windows.controls), 2 * scene.model.nv)
             found.append(point[first : first + shape[0] * shape[1]].reshape(shape))
             first += shape[0] * shape[1]
         return found
 
     def scenes(self, values: np.ndarray) -> tuple[Scene, ...]:
-        """Return the experiments' scenes with these values."""
+        """Return the scenes with these values."""
         vector = jnp.asarray(values, self.coordinates.nominal.dtype)
-        return tuple(one.apply(one.scene, vector) for one in self.experiments)
+        return tuple(self._put(scene, vector) for scene in self.nominal)
 
-    def held_out_rms(self, *points: np.ndarray) -> tuple[float, float] | None:
-        """Return the rms residuals of the held-out recordings at each point; None without any."""
-        judged = [stack(one.scene, one.held_out) if one.held_out else None for one in self.experiments]
+    def held_out_rms(self, held_out: Sequence[Sequence[Recording]], *points: np.ndarray) -> tuple[float, float] | None:
+        """Return the rms residuals of held-out recordings at each of two points; None without any."""
+        judged = [stack(scene, one) if one else None for scene, one in zip(self.nominal, held_out, strict=True)]
         if not any(judged):
             return None
-        program, sums = jax.jit(self._sums), []
-        for point in points:
-            vector = jnp.asarray(point, self.coordinates.nominal.dtype)
-            sums.append(compile_once(program.lower(judged, vector[None]))(judged, vector[None])[0, -1])
-        first, last = (math.sqrt(float(x) / _num_numbers([one for one in judged if one is not None])) for x in sums)
-        return first, last
+        vectors = jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
+        sums = compile_once(jax.jit(self._sums).lower(judged, vectors))(judged, vectors)[:, -1]
+        first, last = np.sqrt(np.asarray(sums, float) / _num_numbers([one for one in judged if one is not None]))
+        return float(first), float(last)
 
 
 def _rms(program: _Program, found: list[tuple[Array, ...]]) -> float:
@@ -318,8 +301,8 @@ def _num_numbers(windows: Sequence[Windows]) -> int:
     return sum(int((np.asarray(w) > 0).sum()) for one in windows for w in one.weight.values())
 
 
-def _descend(program: _Program, point: Array, max_steps: int, log: Log | None):
-    """Return the best point, its linear model, steps, whether it converged, the first rms, and the removable share."""
+def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -> _End:
+    """Minimise the residuals from a point by Levenberg-Marquardt."""
     lower, upper = program.box()
     found = best = program(point)
     first = _rms(program, found)
@@ -345,11 +328,11 @@ def _descend(program: _Program, point: Array, max_steps: int, log: Log | None):
             log(count, {"rms": rms, "is_accepted": float(is_accepted)})
         is_near = removable * program.num_numbers < _NEAR_ENOUGH**2
         if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS or slow == _SLOW_STEPS:
-            return point, best, count, True, first, removable
+            return _End(point, best, count, True, first, removable)
         state = eqx.tree_at(lambda s: s.y_eval, state, jnp.clip(state.y_eval, lower, upper))
         found = program(state.y_eval)
         linear = _linear_model(program, found, state.y_eval, size)
-    return point, best, max_steps, False, first, removable
+    return _End(point, best, max_steps, False, first, removable)
 
 
 @functools.lru_cache(maxsize=32)

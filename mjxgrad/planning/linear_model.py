@@ -101,12 +101,11 @@ class Analytic(Smoother):
 
     def linear_model(self, system, state, control, key, *, wrt_state=True):
         system = self._smoothed(system)
-        noise = jnp.zeros((1, system.num_changes + system.num_controls), state.dtype)
-        jacobian, ends = _linearised(system, state, control, noise, wrt_state)
-        change, jacobian = _changes(system, ends, ends[0], jacobian)
+        noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
+        end, (change,), (jacobian,) = _linearised(system, state, control, noise, wrt_state)
         is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
-        exact, none = jnp.zeros_like(jacobian[0]), jnp.zeros_like(change[0])
-        return _model(system, ends[0], jacobian[0], exact, none, none, is_finite[None], least=1)
+        exact, none = jnp.zeros_like(jacobian), jnp.zeros_like(change)
+        return _model(system, end, jacobian, exact, none, none, is_finite[None], least=1)
 
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)
@@ -179,9 +178,8 @@ class Sampled(Smoother):
         """
         stddev = self._stddev(system, state.dtype, least=2)
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
-        # The step without noise runs in the same batch: a separate call would be compiled a second time.
-        jacobian, ends = _linearised(system, state, control, jnp.pad(noise, ((1, 0), (0, 0))), wrt_state)
-        value, jacobian = _changes(system, ends[1:], ends[0], jacobian[1:])
+        nominal, value, jacobian = _linearised(system, state, control, noise, wrt_state)
+        value, jacobian = value[1:], jacobian[1:]
         is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
         jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
         value = jnp.where(is_finite[:, None], value, 0.0)
@@ -190,7 +188,7 @@ class Sampled(Smoother):
         others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
         seen = noise[:, -jacobian.shape[2] :]
         rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, seen), is_finite)
-        return _model(system, ends[0], mean, error, rest, rest_error, is_finite, least=2)
+        return _model(system, nominal, mean, error, rest, rest_error, is_finite, least=2)
 
     def _zeroth_order(
         self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
@@ -276,8 +274,8 @@ def _sampled(
 
 def _linearised(
     system: System, state: StateVector, control: ControlVector, noise: _Samples, wrt_state: bool
-) -> tuple[Float[Array, "N state columns"], Float[Array, "N state"]]:
-    """Return the derivative of the next state and the next state, for each sample of noise."""
+) -> tuple[StateVector, Float[Array, "M n"], Float[Array, "M n columns"]]:
+    """Return the next state without noise; and changes from it with their derivatives, of it, then of each sample."""
     columns = jnp.arange(0 if wrt_state else system.num_changes, noise.shape[1])
 
     def sample(noise):
@@ -287,18 +285,13 @@ def _linearised(
 
         return jax.jacfwd(moved, has_aux=True)(jnp.zeros(columns.size, state.dtype))
 
-    return jax.vmap(sample)(noise)
+    # The step without noise runs in the same batch: a separate call would be compiled a second time.
+    jacobians, ends = jax.vmap(sample)(jnp.pad(noise, ((1, 0), (0, 0))))
 
+    def change(end, jacobian):
+        return system.difference(end, ends[0]), jax.jacfwd(system.difference)(end, ends[0]) @ jacobian
 
-def _changes(
-    system: System, ends: Float[Array, "N state"], nominal: StateVector, jacobian: Float[Array, "N state columns"]
-) -> tuple[Float[Array, "N n"], Float[Array, "N n columns"]]:
-    """Return states and their derivatives as changes from the nominal state."""
-
-    def one(end, jacobian):
-        return system.difference(end, nominal), jax.jacfwd(system.difference)(end, nominal) @ jacobian
-
-    return jax.vmap(one)(ends, jacobian)
+    return ends[0], *jax.vmap(change)(ends, jacobians)
 
 
 def _mean(

@@ -212,18 +212,16 @@ class GoalCost(Cost):
         stage_weight: weight of the distance in each step, per coordinate of a change.
         terminal_weight: weight of the distance at the end, per coordinate of a change.
         control_weight: weight of each control.
-        resting: the control without cost.
     """
 
     goal: StateVector
     stage_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     terminal_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
-    resting: Float[Array, "..."] = eqx.field(converter=jnp.asarray, default=0.0)
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
-        distance, effort = system.difference(state, self.goal), control - self.resting
-        return 0.5 * (jnp.sum(self.stage_weight * distance**2) + jnp.sum(self.control_weight * effort**2))
+        distance = system.difference(state, self.goal)
+        return 0.5 * (jnp.sum(self.stage_weight * distance**2) + jnp.sum(self.control_weight * control**2))
 
     def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
         return 0.5 * jnp.sum(self.terminal_weight * system.difference(state, self.goal) ** 2)

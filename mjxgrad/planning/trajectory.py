@@ -38,8 +38,6 @@ class Iterations(eqx.Module):
         cost: cost of the system itself under the same controls, infinite if it diverged.
         step: accepted step length, 0 if none lowered the smoothed cost.
         promised: decrease of the smoothed cost that the model predicts for a full step.
-        regularisation: regularisation of the backward pass.
-        finite_fraction: smallest share of finite samples behind a linear model.
     """
 
     factor: _Row
@@ -47,8 +45,6 @@ class Iterations(eqx.Module):
     cost: _Row
     step: _Row
     promised: _Row
-    regularisation: _Row
-    finite_fraction: _Row
 
 
 class Plan(eqx.Module):
@@ -57,7 +53,6 @@ class Plan(eqx.Module):
     Attributes:
         controls: controls, one row per step.
         states: states of the system itself under these controls.
-        gain: last feedback gain around the smoothed trajectory.
         start_cost: cost of the given controls, without smoothing.
         cost: cost of the best controls, without smoothing; never above `start_cost`.
         iterations: records of the iterations.
@@ -69,7 +64,6 @@ class Plan(eqx.Module):
 
     controls: _Controls
     states: Float[Array, "states state"]
-    gain: Float[Array, "horizon m n"]
     start_cost: _Scalar
     cost: _Scalar
     iterations: Iterations
@@ -92,19 +86,14 @@ class Plan(eqx.Module):
 class Feedback(eqx.Module):
     """The feedback law du = step k + K dx around a trajectory; rows of K are zero for controls at a limit.
 
-    `slope` and `curvature` are the derivatives of the cost by the step length at 0. `is_sound` is whether the quadratic
+    `promised` is the decrease of the cost that the model predicts for a full step. `is_sound` is whether the quadratic
     program of every step was solved.
     """
 
     change: _Controls
     gain: Float[Array, "horizon m n"]
-    slope: _Scalar
-    curvature: _Scalar
+    promised: _Scalar
     is_sound: Bool[Array, ""]
-
-    def promised(self, step: ArrayLike = 1.0) -> _Scalar:
-        """Return the decrease of the cost that the model predicts."""
-        return -jnp.asarray(step) * (self.slope + 0.5 * jnp.asarray(step) * self.curvature)
 
 
 class _Course(eqx.Module):
@@ -145,14 +134,14 @@ class _Problem(eqx.Module):
         return _Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
     def law(self, smoother: Smoother, course: _Course, regularisation: _Scalar):
-        """Return the feedback law around a course, the least share of finite samples, and the unmoved coordinates."""
+        """Return the feedback law around a course, and the unmoved coordinates."""
         system, cost, states, controls = self.system, self.cost, course.states, course.controls
         models = jax.vmap(lambda *at: smoother.linear_model(system, *at))(states[:-1], controls, self.keys)
         stages = jax.vmap(lambda *at: stage_model(cost, system, *at))(states[:-1], controls)
         terminal = terminal_model(cost, system, states[-1])
         low, high = self.lower - controls, self.upper - controls
         law = backward_pass(models, stages, terminal, low, high, regularisation)
-        return law, models.finite_fraction.min(), _unmoved(models, stages, terminal, course.cost)
+        return law, _unmoved(models, stages, terminal, course.cost)
 
 
 def optimise_trajectory(
@@ -215,14 +204,14 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
     steps = jnp.array((0.0, *_STEPS), start.dtype)
     zero, m = jnp.zeros((), start.dtype), system.num_controls
     no_gain = jnp.zeros((horizon, m, system.num_changes), start.dtype)
-    rest = Feedback(jnp.zeros((horizon, m), start.dtype), no_gain, zero, zero, jnp.asarray(True))
+    rest = Feedback(jnp.zeros((horizon, m), start.dtype), no_gain, zero, jnp.asarray(True))
     at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
     given = _Course(at_start, jnp.clip(controls, problem.lower, problem.upper), jnp.asarray(jnp.inf, start.dtype))
 
     def iterate(carry, inputs):
         course, best, regularisation, *_ = carry
         factor, following, is_first = inputs
-        law, fraction, unmoved = problem.law(smoother.scaled(factor), course, regularisation)
+        law, unmoved = problem.law(smoother.scaled(factor), course, regularisation)
         tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
         index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
         course = jax.tree.map(lambda x: x[index], tried)
@@ -232,20 +221,19 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
         change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
         after = jnp.clip(change * regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
         after = jnp.where(is_first, regularisation, after)
-        row = Iterations(factor, course.cost, true.cost, steps[index], law.promised(), regularisation, fraction)
-        return (course, best, after, law.gain, unmoved), row
+        row = Iterations(factor, course.cost, true.cost, steps[index], law.promised)
+        return (course, best, after, unmoved), row
 
     # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
     inputs = (present, following, jnp.arange(len(present)) == 0)
     nothing = jnp.zeros(system.num_changes, bool)
-    carry = (given, given, jnp.asarray(_LEAST_REGULARISATION, start.dtype), rest.gain, nothing)
-    (course, best, _, gain, unmoved), rows = jax.lax.scan(iterate, carry, inputs)
+    carry = (given, given, jnp.asarray(_LEAST_REGULARISATION, start.dtype), nothing)
+    (course, best, _, unmoved), rows = jax.lax.scan(iterate, carry, inputs)
     start_cost, rows = rows.cost[0], jax.tree.map(lambda x: x[1:], rows)
     return Plan(
         controls=best.controls,
         states=best.states,
-        gain=gain,
         start_cost=start_cost,
         cost=best.cost,
         iterations=rows,
@@ -321,7 +309,7 @@ def backward_pass(
     n = models.A.shape[-1]
 
     def back(carry, inputs):
-        value, slope_sum, curvature_sum, sound = carry
+        value, promised, sound = carry
         A, B, stage, low, high = inputs
         both = jnp.concatenate([A, B], axis=1)
         gradient = stage.gradient + both.T @ value.gradient
@@ -335,15 +323,13 @@ def backward_pass(
         affine = jnp.concatenate([jnp.zeros(n, k.dtype), k])
         value_hessian = closed.T @ hessian @ closed
         value = Quadratic(closed.T @ (gradient + hessian @ affine), 0.5 * (value_hessian + value_hessian.T))
-        carry = (value, slope_sum + q_u @ k, curvature_sum + k @ q_uu @ k, sound & minimum.is_sound)
-        return carry, (k, K)
+        return (value, promised - q_u @ k - 0.5 * k @ q_uu @ k, sound & minimum.is_sound), (k, K)
 
-    zero = jnp.zeros((), models.A.dtype)
-    start = (terminal, zero, zero, jnp.asarray(True))
+    start = (terminal, jnp.zeros((), models.A.dtype), jnp.asarray(True))
     inputs = (models.A, models.B, stages, lower, upper)
-    (_, slope, curvature, sound), (k, K) = jax.lax.scan(back, start, inputs, reverse=True)
+    (_, promised, sound), (k, K) = jax.lax.scan(back, start, inputs, reverse=True)
     sound &= jnp.all(jnp.isfinite(k)) & jnp.all(jnp.isfinite(K))
-    return Feedback(k, K, slope, curvature, sound)
+    return Feedback(k, K, promised, sound)
 
 
 class BoxMinimum(eqx.Module):

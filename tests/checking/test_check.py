@@ -17,7 +17,7 @@ import mjxgrad as mg
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
 from mjxgrad.checking.measure import Line, Measured, _estimates, measure
-from mjxgrad.checking.motions import random_motions
+from mjxgrad.checking.motions import most_contacts, random_motions
 from mjxgrad.checking.moving import KINDS, REFINED, Direction, Moved, Mover, change_of_poses
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
@@ -205,6 +205,15 @@ def test_rounding_is_no_jump_and_no_slope(diverges):
     assert readings == {num_moving * (len(measured.times) - diverges)}
 
 
+@pytest.mark.parametrize(("height", "expected"), [(0.009, 4), (0.011, 1)])
+def test_contacts_nearer_than_a_centimetre_are_counted(height, expected):
+    box = mg.load_scene(
+        """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/>
+        <geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+    )
+    assert most_contacts(box, np.array([[[0, 0, 0.1 + height, 1, 0, 0, 0]]])) == expected
+
+
 def test_a_body_that_is_put_down_touches_from_the_start():
     """Its distance is zero at first, and negative from the first step on."""
     resting, falling = (random_motions(mg.load_scene(ball(height=z)), np.random.default_rng(0)) for z in (0.05, 0.3))
@@ -271,7 +280,7 @@ def test_hit_or_miss_is_named_with_its_pair(wall):
 def test_a_bounce_has_its_slope_and_not_by_mujocos_own_derivative(bounce):
     """Contact begins with a jump, at an impedance of 0.9, which MuJoCo's derivative does not see."""
     slope, discrete = slopes(bounce.measured)
-    assert discrete.share_off > slope.share_off
+    assert discrete.num_off > slope.num_off
     assert bounce.recommendation.gradient == "slope"
     assert bounce.recommendation.estimator == "first_order"
     assert "jump" not in kinds(bounce)
@@ -302,7 +311,7 @@ def line_of(slope, discrete, growth=1.0, fine=1.0):
     outcomes = np.repeat(places[:, None], 2, axis=1)[:, :, None]
     filled = [np.broadcast_to(np.reshape(one, (-1, 1, 1)), outcomes.shape) for one in (slope, discrete)]
     plain, shorter = (compare_to_slope(places, rise * outcomes, filled, KINDS) for rise in (1.0, fine))
-    none = Jumps(places, places, *[np.zeros(0)] * 3, steepest=1.0, scale=1.0, resolution=1e-3, num_finite=64)
+    none = Jumps(places, places, *[np.zeros(0)] * 3, steepest=1.0, scale=1.0)
     line = Line("the reference pose", "the start", plain, shorter, none, (), growth * np.ones(2), 0)
     return Measured(np.array([0.05, 0.1]), 50, (line,), ())
 

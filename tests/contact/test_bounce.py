@@ -7,6 +7,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.contact.bounce import Bounce
+from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.stepping import own_motion
 
 DURATION = 0.1
@@ -28,7 +29,12 @@ def found():
         state = mg.initial_state(scene, qpos=start[None], qvel=jnp.array([-1.0]))
         return mg.rollout(scene, state, horizon=round(DURATION / TIMESTEP), contact=own_motion(gradient)).qpos[-1, 0]
 
-    return mg.diagnostics.derivative_against_slope(height, (0.005, 0.025), num_phases=64)
+    starts = phases((0.005, 0.025), 64)
+    moved = {
+        name: jax.jit(jax.vmap(jax.value_and_grad(lambda x, name=name: height(x, name))))(jnp.asarray(starts))
+        for name in ("discrete", "slope")
+    }
+    return compare_to_slope(starts, moved["discrete"][0], [slope for _, slope in moved.values()])
 
 
 def test_a_critically_damped_ball_keeps_the_share_exp_minus_two():

@@ -43,9 +43,8 @@ def jumps():
         objective,
         POINTS,
         jax.random.key(1),
-        softness=[{"height": height} for height in HEIGHTS],
+        softness={"height": HEIGHTS},
         num_samples=4000,
-        baseline="zero_noise",
         progress=lambda done, total: progress.append((done, total)),
     )
     return table, calls, progress
@@ -141,22 +140,6 @@ def test_the_table_says_what_is_biased_and_how_large(jumps):
     assert any(cell.strip().endswith("*") for cell in cells)
 
 
-def test_norms_of_several_parameters_lie_in_their_intervals():
-    point, stddev = np.array([0.5, -1.2, 0.4]), np.array([0.1, 0.4, 0.2])
-    table = bias_variance(
-        lambda scale: parameter_noise(lambda x: scale * textbook.bumpy(x), jnp.asarray(stddev)),
-        jnp.asarray(point)[None],
-        jax.random.key(3),
-        softness=jnp.array([1.0, 3.0]),
-        num_samples=500,
-        num_reference=4000,
-    ).table()
-    exact = np.array([1.0, 3.0]) * np.linalg.norm(textbook.bumpy_gradient(point, stddev))
-    assert (table["truth_low"][:, 0] < exact).all()
-    assert (exact < table["truth_high"][:, 0]).all()
-    assert (table["zeroth_bias_low"] == 0).all()
-
-
 def test_the_picture_has_every_estimate_and_axes_with_units(jumps):
     pyplot = pytest.importorskip("matplotlib.pyplot")
     pyplot.switch_backend("Agg")
@@ -202,6 +185,10 @@ def test_several_parameters_take_a_long_run_for_reference():
     assert table.landscape is None
     np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
     np.testing.assert_array_less(np.abs(table.bias), 4 * table.bias_error)
+    norms, norm = table.table(), np.linalg.norm(exact, axis=1)
+    assert (norms["truth_low"][:, 0] < norm).all()
+    assert (norm < norms["truth_high"][:, 0]).all()
+    assert (norms["zeroth_bias_low"] == 0).all()
 
 
 class Hidden(ParameterNoise):
@@ -256,13 +243,9 @@ def test_a_cost_that_is_not_finite_leaves_no_reference_within_reach():
     ("arguments", "sentence"),
     [
         ({"params": jnp.array([0.1])}, r"params must have shape \(points, dim\), got \(1,\)"),
-        ({"baseline": "mean"}, "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'"),
         ({"num_samples": 1}, "num_samples must be at least 2, got 1"),
         ({"num_reference": 3}, "num_reference must be at least 4, got 3"),
-        ({"alpha_samples": 3}, "alpha_samples must be at least 4, got 3"),
-        ({"softness": []}, "softness must have at least one value, got none"),
         ({"softness": {"a": jnp.ones(2), "b": jnp.ones(3)}}, "softness must have the same leading axis in every leaf"),
-        ({"softness": [{"a": 1.0}, {"b": 1.0}]}, "softness must have the same parts set in every value, got 2"),
         ({"confidence": 95.0}, "confidence must be between 0 and 1, got 95.0"),
     ],
 )
@@ -283,11 +266,11 @@ def test_intervals_of_means_cover_as_often_as_they_say():
 
 def test_bootstrap_intervals_cover_where_samples_are_not_normal():
     """Two exponential coordinates, total variance 1 + 9; chi-square covers 68 % of the time here."""
-    rng, times = np.random.default_rng(2), 300
+    rng, times = np.random.default_rng(2), 100
     covers = 0
     for _ in range(times):
         samples = rng.exponential([1.0, 3.0], (400, 2))
-        low, high = bootstrap_variance_interval(samples, 0.9, num_resamples=300)
+        low, high = bootstrap_variance_interval(samples, 0.9)
         covers += low < 10 < high
     # Percentile intervals of a skewed variance cover somewhat less than they say.
     assert covers / times == pytest.approx(0.88, abs=4 * np.sqrt(0.1 / times))

@@ -6,6 +6,7 @@ import pytest
 
 from mjxgrad.diagnostics import jumps_along
 
+RESOLUTION = 2 / 255 / 17**6  # of a path of length 2: 256 points, each interval in 17 parts six times
 BOX_ON_BOX = """<mujoco><option gravity="0 0 0"/><default><geom condim="1" type="box" size=".1 .1 .1"/></default><worldbody>
 <geom/><body><freejoint/><geom {shape}/></body></worldbody></mujoco>"""
 
@@ -28,14 +29,14 @@ def static_force(shape, depth):
 
 def test_a_step_on_a_slope_has_its_place_and_its_size():
     found = jumps_along(lambda x: 3 * x + 0.7 * (x > 0.3), (-1.0, 1.0))
-    assert found.places == pytest.approx([0.3], abs=found.resolution)
-    assert found.sizes == pytest.approx([0.7], abs=4 * found.resolution)  # the slope within the last interval
+    assert found.places == pytest.approx([0.3], abs=RESOLUTION)
+    assert found.sizes == pytest.approx([0.7], abs=4 * RESOLUTION)  # the slope within the last interval
     assert found.steepest == pytest.approx(3, rel=1e-4)  # rounding of an interval of 1e-10
 
 
 def test_every_step_of_a_stair_is_found_once():
     found = jumps_along(lambda x: np.floor(5 * x), (0.05, 2.05))
-    assert found.places == pytest.approx(np.arange(1, 11) / 5, abs=found.resolution)
+    assert found.places == pytest.approx(np.arange(1, 11) / 5, abs=RESOLUTION)
     assert found.share == 1.0
 
 
@@ -72,7 +73,6 @@ def test_of_more_jumps_than_candidates_the_largest_remain():
 def test_beside_what_is_not_finite_no_jump_is_claimed():
     found = jumps_along(lambda x: np.where(x > 0.5, np.nan, 1.0 * (x > 0.25)), (0.0, 1.0))
     assert found.places == pytest.approx([0.25])
-    assert found.num_finite == 128
 
 
 @pytest.mark.parametrize("depth", [0.005, 0.002])

@@ -1,11 +1,9 @@
 """Derivatives held against the slope: on functions whose slope and derivative are known."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxgrad.diagnostics import compare_to_slope, derivative_against_slope, phases
+from mjxgrad.diagnostics import compare_to_slope, phases
 
 INTERVAL = (0.2, 0.7)
 
@@ -120,20 +118,6 @@ def test_an_error_of_rounding_alone_is_none():
     assert found.relative_error.tolist() == [0.0, 0.0]
 
 
-def test_one_function_is_compared_for_each_gradient_by_its_name():
-    """The outcome is x² at one time and 2x at another; the gradient "cut" keeps the value and loses the first derivative."""
-
-    def simulate(x, gradient):
-        square = jax.lax.stop_gradient(x**2) if gradient == "cut" else x**2
-        return jnp.stack([square, 2 * x])
-
-    found = derivative_against_slope(simulate, INTERVAL, gradients=("cut", "exact"))
-    assert found.outcomes.shape == (64, 2)
-    assert found.mean[0].tolist() == [0.0, pytest.approx(2.0)]
-    assert found.mean[1] == pytest.approx(found.slope, rel=2e-3)
-    assert found.relative_error[0, 0] == 1.0
-
-
 @pytest.mark.parametrize(
     ("interval", "num_phases", "sentence"),
     [
@@ -153,5 +137,3 @@ def test_shapes_that_do_not_fit_are_refused():
         compare_to_slope(x, x, [x[:-1]], ["short"])
     with pytest.raises(ValueError, match="parameters must be at least 32 and increase"):
         compare_to_slope(x[::-1], x, [x], ["backwards"])
-    with pytest.raises(ValueError, match="gradients must name at least one"):
-        derivative_against_slope(lambda x, gradient: x, INTERVAL, gradients=())

@@ -1,13 +1,11 @@
 """A scene's springs beside its time step, against closed forms, the textbook's bounce and C MuJoCo's own steps."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.diagnostics import UnsoundGradientError, check_soundness, soundness
 
 SCENE = """
 <mujoco>
@@ -158,22 +156,3 @@ def test_the_summary_names_the_scene_its_springs_and_its_warnings():
 def test_a_speed_that_is_none_is_refused(speed):
     with pytest.raises(ValueError, match="speed must be positive"):
         _report(speed=speed)
-
-
-def test_a_gradient_is_unsound_for_each_of_its_reasons():
-    good = {"a": jnp.ones(3), "b": jnp.array(2.0)}
-    assert bool(soundness(good).is_sound)
-    assert not bool(soundness(good, diverged=True).is_sound)
-    assert not bool(soundness(good | {"b": jnp.array(jnp.nan)}).is_sound)
-    bounded = soundness(good | {"b": jnp.array(-1e5)}, bound=1e4)
-    assert bool(bounded.explodes)
-    assert not bool(bounded.is_sound)
-    assert float(bounded.largest) == 1e5
-
-
-def test_unsound_gradients_are_raised_with_their_counts():
-    batch = jnp.array([[1.0, 2.0], [jnp.nan, 1.0], [jnp.inf, jnp.nan]])
-    found = jax.vmap(soundness)(batch)
-    with pytest.raises(UnsoundGradientError, match=r"2 of 3 gradients must not be used: 2 are not finite"):
-        check_soundness(found)
-    check_soundness(soundness(batch[0]))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad import diagnostics, estimators
+from mjxgrad import estimators
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 
@@ -79,35 +79,6 @@ def test_a_policy_gets_its_gradient_in_its_own_form(key):
         vector = compiled(objective, objective.ravel(policy), key, num_samples=8)
         assert tree.value["gain"].shape == (1, 2)
         np.testing.assert_allclose(objective.ravel(tree.value), vector.value, rtol=1e-12)
-
-
-def test_a_comparison_takes_them_and_a_reference_of_their_form(key):
-    truth = textbook.bumpy_gradient(np.asarray(VECTOR), np.asarray(STDDEV))
-    tables = [
-        diagnostics.compare(
-            {"first": estimators.first_order}, objective, params, key,
-            budget=diagnostics.Rollouts(10), reference=reference, num_repeats=5,
-        )
-        for objective, params, reference in (
-            (VECTOR_OBJECTIVE, VECTOR, truth),
-            (OBJECTIVE, FORMS["dict"], {"force": truth[:2], "place": truth[2]}),
-        )
-    ]  # fmt: skip
-    np.testing.assert_allclose(tables[1].bias, tables[0].bias, rtol=1e-9)
-
-
-def test_a_sweep_over_softness_takes_points_of_their_form(key):
-    def swept(objective, points):
-        return diagnostics.bias_variance(
-            lambda scale: objective.with_stddev(scale * STDDEV), points, key,
-            softness=jnp.array([1.0]), num_samples=8, num_reference=8, num_resamples=10,
-        )  # fmt: skip
-
-    points = jnp.stack([VECTOR, 2 * VECTOR])
-    vector = swept(VECTOR_OBJECTIVE, points)
-    tree = swept(OBJECTIVE, {"force": points[:, :2], "place": points[:, 2]})
-    np.testing.assert_array_equal(tree.params, points)
-    np.testing.assert_allclose(tree.first.value, vector.first.value, rtol=1e-9)
 
 
 def test_parameters_without_a_number_to_move_are_refused(key):

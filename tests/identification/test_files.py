@@ -79,16 +79,14 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
         files.recording(scene, tmp_path / "a.csv")
 
 
-def test_parameters_are_named_in_a_word_and_come_back_from_yaml(scene, tmp_path):
+def named(scene, given):
+    return {text.partition("=")[0]: files.parameter(scene, text) for text in given}
+
+
+def test_parameters_are_named_in_a_word(scene):
     given = ["mass:cart=0.5..3", "inertia:ball", "friction:floor/ball", "damping:x", "gains:servo", "delay=0..0.1"]
-    found = files.parameters(scene, given)
-    assert list(found) == [text.partition("=")[0] for text in given]
+    found = named(scene, given)
     assert (found["mass:cart"].nominal, found["mass:cart"].upper, found["delay"].upper) == (2.0, 3.0, 0.1)
-    path = tmp_path / "start.yaml"
-    rest = "nominal: [2.], min_value: [1.], max_value: [4.], value: [2.5]}"
-    path.write_text(f"mass:cart: {{frozen: false, {rest}\ndamping:x: {{frozen: true, {rest}\n")
-    (again,) = files.parameters(scene, [str(path)]).values()
-    assert (again.nominal, again.lower, again.upper) == (2.5, 1.0, 4.0)
     for wrong, said in (("weight:cart", "kind one of mass"), ("mass", "must say of what"), ("gear:no", "no")):
         with pytest.raises(ValueError, match=said):
             files.parameter(scene, wrong)
@@ -99,7 +97,7 @@ def test_the_written_scene_has_the_numbers_that_were_found(scene, tmp_path):
     source = tmp_path / "scene.xml"
     source.write_text(_SCENE)
     given = ["inertia:cart", "mass:ball", "friction", "damping:x", "armature:x=0..1", "friction_loss:x=0..1", "gear:x"]
-    wanted = files.parameters(scene, [*given, "gains:servo", "damping_ratio", "stiffness", "width"])
+    wanted = named(scene, [*given, "gains:servo", "damping_ratio", "stiffness", "width"])
     values = {name: jnp.asarray(0.1 + 0.9 * one.nominal) for name, one in wanted.items()}
     found = write_all(scene, wanted, values)
     (tmp_path / "out").mkdir()

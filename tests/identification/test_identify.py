@@ -272,7 +272,7 @@ def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, com
         place = _course(gear=3.3) + pull / 4 * (_STEP * np.arange(_STEPS + 1)) ** 2
         place += 1e-4 * np.random.default_rng(0).normal(size=place.shape)
         recording = Recording({"place": place}, _DRIVE[:, None], noise={"place": 1e-4})
-        results.append(mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], num_points=32))
+        results.append(mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording]))
     assert len(compilations) == before
     assert not results[0].warnings()
     assert f"{results[2].rms[1]:.3g} times the noise" in results[2].summary()

@@ -8,6 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import identification
+from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.identification.inertia import body_fields, logarithms, pseudo_inertia, second_moments
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 
@@ -106,14 +107,7 @@ def test_the_derivative_by_ten_numbers_is_that_of_the_tensor(body):
 
     def there_and_back(numbers):
         fields = body_fields(pseudo_inertia(numbers))
-        w, x, y, z = fields["body_iquat"]
-        rotation = jnp.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        rotation = rotation_matrix(fields["body_iquat"])
         about = rotation @ jnp.diag(jnp.sum(fields["body_inertia"]) / 2 - fields["body_inertia"]) @ rotation.T
         offset = jnp.append(fields["body_ipos"], 1.0)
         return fields["body_mass"] * jnp.outer(offset, offset) + jnp.pad(about, (0, 1))

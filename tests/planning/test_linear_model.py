@@ -32,6 +32,11 @@ def edge(state, control):
     return 1.0 * (state + control > 0)
 
 
+def cliff(state, control):
+    """Beyond one standard deviation there are no numbers."""
+    return jnp.where(state < -STDDEV, jnp.nan, state) + control
+
+
 def within(value, error, expected, errors=4.0):
     np.testing.assert_array_less(np.abs(np.asarray(value) - expected), errors * np.asarray(error) + 1e-12)
 
@@ -96,16 +101,16 @@ def test_only_least_squares_sees_a_jump(key):
     assert first_order(*at, **noise).A[0, 0] == 0
 
 
+def repeated(estimate, key, times, num_samples):
+    """Return many estimates of the same model."""
+    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
+    noise = {"stddev_state": STDDEV, "stddev_control": 0.1, "num_samples": num_samples}
+    return jax.jit(jax.vmap(lambda key: estimate(*at, key, **noise)))(jax.random.split(key, times))
+
+
 @pytest.mark.parametrize("estimate", [first_order, zeroth_order])
 def test_errors_are_those_that_repetition_shows(key, estimate):
-    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
-
-    @jax.jit
-    @jax.vmap
-    def repeat(key):
-        return estimate(*at, key, stddev_state=STDDEV, stddev_control=0.1, num_samples=60)
-
-    models = repeat(jax.random.split(key, 600))
+    models = repeated(estimate, key, 600, 60)
     for name, errors in (("A", models.A_error), ("c", models.c_error)):
         spread = np.asarray(getattr(models, name)).std(axis=0)
         # A standard deviation of 600 repetitions is known to 3 %; HC3 errs to the wide side by about as much as 3/60.
@@ -114,27 +119,13 @@ def test_errors_are_those_that_repetition_shows(key, estimate):
 
 def test_few_samples_do_not_bias_the_mean(key):
     """What a sample's own Jacobian explained of its end would shift c by E[J w]/N, here a third of its spread at N = 4."""
-    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
-
-    @jax.jit
-    @jax.vmap
-    def repeat(key):
-        return first_order(*at, key, stddev_state=STDDEV, stddev_control=0.1, num_samples=4).c
-
-    found = np.asarray(repeat(jax.random.split(key, 4000)))
+    found = np.asarray(repeated(first_order, key, 4000, 4).c)
     within(found.mean(axis=0), found.std(axis=0) / np.sqrt(len(found)), exact_wall()[1])
 
 
 def test_errors_from_few_samples_do_not_flatter(key):
     """Twelve samples for three coefficients: residuals are 0.57 of what repetition shows, unless leverage is taken out."""
-    at = (FunctionSystem(wall, 1, 1), jnp.array([POINT]), CONTROL)
-
-    @jax.jit
-    @jax.vmap
-    def repeat(key):
-        return zeroth_order(*at, key, stddev_state=STDDEV, stddev_control=0.1, num_samples=12)
-
-    models = repeat(jax.random.split(key, 3000))
+    models = repeated(zeroth_order, key, 3000, 12)
     for value, error in ((models.A, models.A_error), (models.c, models.c_error)):
         ratio = np.sqrt((np.asarray(error) ** 2).mean()) / np.asarray(value).std()
         assert 0.95 < ratio < 1.4
@@ -148,13 +139,10 @@ def test_the_mean_step_is_the_mean_that_the_models_hold(key):
 
 @pytest.mark.slow
 def test_samples_that_are_not_finite_are_left_out_and_counted(key):
-    def cliff(state, control):
-        return jnp.where(state < -0.05, jnp.nan, 3 * state) + control
-
     at = (FunctionSystem(cliff, 1, 1), jnp.array([0.0]), CONTROL, key)
     for estimate in (first_order, zeroth_order):
         model = estimate(*at, stddev_state=STDDEV, stddev_control=0.1, num_samples=400)
-        np.testing.assert_allclose(model.A, 3.0, atol=1e-9)
+        np.testing.assert_allclose(model.A, 1.0, atol=1e-9)
         within(model.finite_fraction, np.sqrt(0.84 * 0.16 / 400), 1 - norm.cdf(-1))
         lost = estimate(FunctionSystem(cliff, 1, 1), jnp.array([-1.0]), CONTROL, key, stddev_state=1e-3, stddev_control=0.1,
                         num_samples=10)  # fmt: skip
@@ -165,10 +153,6 @@ def test_samples_that_are_not_finite_are_left_out_and_counted(key):
 
 def test_a_mean_step_leaves_out_what_is_not_finite(key):
     """Beyond the cliff there are no numbers; the rest of the samples is a normal distribution cut off at one deviation."""
-
-    def cliff(state, control):
-        return jnp.where(state < -STDDEV, jnp.nan, state) + control
-
     at = (FunctionSystem(cliff, 1, 1), jnp.zeros(1), CONTROL, key)
     mean = mean_step(*at, stddev_state=STDDEV, stddev_control=0.0, num_samples=4000)
     within(mean, STDDEV / np.sqrt(8000), STDDEV * norm.pdf(1) / norm.cdf(1))

@@ -206,7 +206,7 @@ def test_to_plan_again_compiles_nothing(compilations):
     given = jnp.zeros((HORIZON, 2))
     for i in range(3):
         before = len(compilations)
-        system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL + i, STAGE, TERMINAL, CONTROL + i, resting=0.1 * i)
+        system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL + i, STAGE, TERMINAL, CONTROL + i)
         smoother = Sampled(0.1 + i, 0.1, num_samples=4, order="first")
         plan = optimise_trajectory(
             system,

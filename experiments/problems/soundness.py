@@ -1,19 +1,13 @@
 """Checks that a gradient is usable: finite, from a rollout that did not diverge, and not exploding.
 
 `Trajectory.diverged` concerns the motion only. A derivative can overflow although the motion is fine. It is zero or stale
-where a rollout diverged and its state was held. Estimators leave out and count such samples; direct users of `jax.grad`
-on a rollout can check here.
+where a rollout diverged and its state was held.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
-
-
-class UnsoundGradientError(FloatingPointError):
-    """A gradient that must not be used."""
 
 
 class Soundness(eqx.Module):
@@ -58,24 +52,3 @@ def soundness(gradient: PyTree, diverged: Bool[ArrayLike, ""] = False, *, bound:
     explodes = largest > (jnp.inf if bound is None else bound)
     diverged = jnp.asarray(diverged, bool)
     return Soundness(~diverged & (num_nonfinite == 0) & ~explodes, num_nonfinite, largest, explodes, diverged)
-
-
-def check_soundness(found: Soundness) -> None:
-    """Raise if any gradient that `soundness` checked, batched or not, is unsound. Call it on the host.
-
-    Raises:
-        UnsoundGradientError: with the number of unsound gradients and the reasons.
-    """
-    unsound = ~np.atleast_1d(found.is_sound)
-    if not unsound.any():
-        return
-    counts = (
-        (np.atleast_1d(found.diverged), "belong to rollouts that diverged"),
-        (np.atleast_1d(found.num_nonfinite) > 0, "are not finite"),
-        (np.atleast_1d(found.explodes), f"exceed the bound, up to {np.max(found.largest):.3g}"),
-    )
-    reasons = ", ".join(f"{is_so.sum()} {what}" for is_so, what in counts if is_so.any())
-    raise UnsoundGradientError(
-        f"{unsound.sum()} of {unsound.size} gradients must not be used: {reasons}; shorten the time step, soften the "
-        "contact, shorten the horizon, or leave these samples out"
-    )

@@ -1,20 +1,18 @@
-"""Comparison of estimators at an equal number of rollouts or equal time."""
+"""Comparison of estimators at an equal number of rollouts, with intervals for errors, biases and variances."""
 
 import dataclasses
-import functools
-import math
-import statistics
-import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from scipy import stats
 
 from mjxgrad.diagnostics.bias_variance import map_in_chunks
-from mjxgrad.diagnostics.statistics import bias_interval, checked, root_mean_square_interval, variance_interval
+from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, checked
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.objective import Objective, as_vector, flattened
 
@@ -22,10 +20,8 @@ from mjxgrad.objective import Objective, as_vector, flattened
 _ROLLOUTS_AT_A_TIME = 4096
 # An estimator may refuse a number of samples (odd ones, say) and take the next smaller one.
 _NEIGHBOURS = 3
-# Time grows nearly linearly, so a line through two measurements hits at the second or third try.
-_CORRECTIONS = 4
-_FEWEST_TIMED = 4
-_MOST_SAMPLES = 1_000_000  # upper end of the search, for very cheap samples
+# With fewer samples a bootstrap misses the tails, and a test of normality has no power.
+_FEWEST_FOR_BOOTSTRAP = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,25 +35,10 @@ class Rollouts:
             raise ValueError(f"count must be at least 2 rollouts, got {self.count}")
 
 
-@dataclasses.dataclass(frozen=True)
-class Seconds:
-    """A budget of wall time per compiled estimate: the median over repeated runs at each number of samples."""
-
-    seconds: float
-    num_runs: int = 7
-
-    def __post_init__(self):
-        if not 0 < self.seconds < math.inf:
-            raise ValueError(f"seconds must be positive and finite, got {self.seconds}")
-        if self.num_runs < 1:
-            raise ValueError(f"num_runs must be at least 1, got {self.num_runs}")
-
-
 class Affordable(NamedTuple):
-    """The number of samples that a budget allows, and the median time of one such estimate; NaN if it was not measured."""
+    """The number of samples that a budget allows."""
 
     num_samples: int
-    seconds: float
 
 
 class Comparison(eqx.Module):
@@ -70,7 +51,6 @@ class Comparison(eqx.Module):
         num_samples: number of samples requested from each estimator.
         num_rollouts: number of rollouts that one estimate reports, at most the budget.
         num_gradient_rollouts: number of differentiated rollouts among them.
-        seconds: median time of one compiled estimate; NaN for a budget of rollouts.
         num_repeats: number of estimates per estimator.
         num_finite: number of finite estimates; all fields below use these alone.
         finite_fraction: mean share of finite samples within the finite estimates.
@@ -93,7 +73,6 @@ class Comparison(eqx.Module):
     num_samples: Int[np.ndarray, " estimators"]
     num_rollouts: Int[np.ndarray, " estimators"]
     num_gradient_rollouts: Int[np.ndarray, " estimators"]
-    seconds: Float[np.ndarray, " estimators"]
     num_repeats: int = eqx.field(static=True)
     num_finite: Int[np.ndarray, " estimators"]
     finite_fraction: Float[np.ndarray, " estimators"]
@@ -123,7 +102,7 @@ def compare(
     params: PyTree,
     key: PRNGKeyArray,
     *,
-    budget: Rollouts | Seconds,
+    budget: Rollouts,
     reference: tuple[PyTree, PyTree] | PyTree,
     num_repeats: int = 200,
     confidence: float = 0.95,
@@ -131,7 +110,7 @@ def compare(
 ) -> Comparison:
     """Measure root-mean-square error, bias and variance of estimators under an equal budget.
 
-    Each estimator gets the largest `num_samples` whose reported rollouts, or measured time, stay within the budget. Its
+    Each estimator gets the largest `num_samples` whose reported rollouts stay within the budget. Its
     repetitions are independent and run in one compiled program. A later call with the same estimator and shapes reuses that
     program. All estimators share the same keys, which reduces chance differences.
 
@@ -141,7 +120,7 @@ def compare(
         objective: the objective to differentiate.
         params: the point: a vector, or a pytree whose floating-point arrays the comparison then has as one vector.
         key: consumed here.
-        budget: `Rollouts(count)` or `Seconds(seconds)` for one estimate.
+        budget: `Rollouts(count)` for one estimate.
         reference: the true gradient, in the form of `params`, and its standard error; or the gradient alone if it is exact (a
             closed form). The error must be well known, from many more samples than an estimate has.
         num_repeats: number of estimates per estimator. At least 2.
@@ -239,7 +218,6 @@ def _row(
         "num_samples": bought.num_samples,
         "num_rollouts": estimates.num_rollouts.flat[0],
         "num_gradient_rollouts": estimates.num_gradient_rollouts.flat[0],
-        "seconds": bought.seconds,
         "num_finite": count,
         "finite_fraction": float((estimates.num_finite / estimates.num_samples)[is_finite].mean()),
         "mean": mean,
@@ -273,72 +251,28 @@ def _reference(
 
 
 def affordable(
-    estimator: Estimator,
-    objective: Objective,
-    params: Float[Array, " dim"],
-    key: PRNGKeyArray,
-    budget: Rollouts | Seconds,
+    estimator: Estimator, objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, budget: Rollouts
 ) -> Affordable:
-    """Return the largest number of samples within a budget: rollouts are counted by tracing, seconds measured by running."""
-    run = functools.partial(_estimate, estimator, objective, params, key)
-    if isinstance(budget, Rollouts):
-        return Affordable(_within_rollouts(run, budget.count), math.nan)
-    return _within_seconds(run, budget)
+    """Return the largest number of samples within a budget of rollouts, as the estimator itself counts them."""
+    count = budget.count
 
-
-def _within_rollouts(run: Callable[..., Any], count: int) -> int:
-    def reported(num_samples: int) -> int:  # XLA drops all but the count as dead code
-        return int(run(num_samples, True))
+    def reported(num_samples: int) -> int:
+        return int(_num_rollouts(estimator, objective, params, key, num_samples))
 
     num_samples, rollouts = _accepted(reported, count)
     while rollouts > count:
         # Proportional, since an estimator may roll out several times per sample.
         fewer = min(num_samples - 1, num_samples * count // rollouts)
         num_samples, rollouts = _accepted(reported, fewer, f"budget of {count} rollouts buys no estimate; ")
-    return num_samples
-
-
-def _within_seconds(run: Callable[..., Any], budget: Seconds) -> Affordable:
-    def timed(num_samples: int) -> float:
-        runs = []
-        for _ in range(1 + budget.num_runs):
-            start = time.perf_counter()
-            jax.block_until_ready(run(num_samples, False))
-            runs.append(time.perf_counter() - start)
-        # The first run compiled.
-        return statistics.median(runs[1:])
-
-    low, low_time = _accepted(timed, _FEWEST_TIMED)
-    if low_time > budget.seconds:
-        raise ValueError(
-            f"budget of {budget.seconds:g} s buys no estimate: {low} samples take {low_time:.3g} s; give more seconds"
-        )
-    high, high_time = low, low_time
-    while high_time <= budget.seconds and high < _MOST_SAMPLES:
-        low, low_time = high, high_time
-        high, high_time = _accepted(timed, min(8 * high, _MOST_SAMPLES))
-    if high_time <= budget.seconds:
-        return Affordable(high, high_time)
-    for _ in range(_CORRECTIONS):
-        slope = max((high_time - low_time) / (high - low), 1e-12)
-        guess = int(low + (budget.seconds - low_time) / slope)
-        guess = min(max(guess, low + 1), high - 1)
-        if guess - low <= low // 50:  # within the accuracy of the clock
-            break
-        tried, seconds = _accepted(timed, guess)
-        if seconds <= budget.seconds:
-            low, low_time = max((low, low_time), (tried, seconds))
-        else:
-            high, high_time = tried, seconds
-    return Affordable(low, low_time)
+    return Affordable(num_samples)
 
 
 @eqx.filter_jit
-def _estimate(
-    estimator: Estimator, objective: Objective, params: Array, key: PRNGKeyArray, num_samples: int, is_counted: bool
-) -> GradientEstimate | Int[Array, ""]:
-    estimate = estimator(objective, params, key, num_samples=num_samples)
-    return estimate.num_rollouts if is_counted else estimate
+def _num_rollouts(
+    estimator: Estimator, objective: Objective, params: Array, key: PRNGKeyArray, num_samples: int
+) -> Int[Array, ""]:
+    # XLA drops all but the count as dead code.
+    return estimator(objective, params, key, num_samples=num_samples).num_rollouts
 
 
 def _accepted(measure: Callable[[int], Any], num_samples: int, context: str = "") -> tuple[int, Any]:
@@ -350,3 +284,134 @@ def _accepted(measure: Callable[[int], Any], num_samples: int, context: str = ""
         except ValueError as error:
             refusal = error
     raise ValueError(f"{context}{refusal}") from refusal
+
+
+def bias_interval(
+    mean: ArrayLike,
+    standard_error: ArrayLike,
+    count: ArrayLike,
+    reference: ArrayLike,
+    reference_error: ArrayLike = 0.0,
+    reference_count: ArrayLike = np.inf,
+    confidence: float = 0.95,
+) -> Float[np.ndarray, "2 *shape"]:
+    """Return Welch's interval of a bias: the difference of a mean to a reference with an error of its own.
+
+    Args:
+        mean: mean of the samples.
+        standard_error: standard error of the mean.
+        count: number of independent samples behind it, at least 2.
+        reference: the true mean, or an estimate independent of the samples.
+        reference_error: standard error of the reference, zero for a closed form.
+        reference_count: number of independent samples behind that error; infinite if it is known.
+        confidence: coverage of the interval.
+
+    Returns:
+        Lower and upper ends, with the Welch-Satterthwaite degrees of freedom; NaN where there is no standard error.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1.
+
+    References:
+        Welch. The generalization of 'Student's' problem when several different population variances are involved.
+        Biometrika 34, 1947, equation 28.
+    """
+    own, other = np.square(np.asarray(standard_error, float)), np.square(np.asarray(reference_error, float))
+    freedom = np.maximum(np.asarray(count, float) - 1, 1)
+    reference_freedom = np.maximum(np.asarray(reference_count, float) - 1, 1)
+    both = own + other
+    scale = np.where(both > 0, both, 1)
+    # As shares of the whole, so that errors of 1e-200 do not underflow when squared.
+    inverse = (own / scale) ** 2 / freedom + (other / scale) ** 2 / reference_freedom
+    with np.errstate(divide="ignore"):
+        freedom = 1 / inverse
+    half = stats.t.ppf(0.5 + checked(confidence) / 2, freedom) * np.sqrt(both)
+    bias = np.asarray(mean, float) - np.asarray(reference, float)
+    return np.stack([bias - half, bias + half])
+
+
+def root_mean_square_interval(
+    squared_errors: Float[np.ndarray, "*batch repeats"],
+    confidence: float = 0.95,
+    *,
+    reference_variance: ArrayLike = 0.0,
+    cross_variance: ArrayLike = 0.0,
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "2 *batch"]]:
+    r"""Return the root-mean-square error of an estimate from its repetitions, with an interval.
+
+    The mean squared error is positive and skewed. Its interval is that of a gamma distribution with equal mean and variance
+    (a
+    chi-square with Satterthwaite's degrees of freedom). For one unbiased normal coordinate with known kurtosis it is exact.
+    Where a bias dominates it becomes the usual normal interval.
+
+    The variance $v$ of a reference adds to the mean and is subtracted. The error of the reference is common to all
+    repetitions, so it widens the interval.
+
+    Args:
+        squared_errors: squared distance of each repetition to the reference.
+        confidence: coverage of the interval.
+        reference_variance: $v$, the sum over coordinates of the reference's squared standard errors.
+        cross_variance: $\sum_j (2 b_j e_j)^2 + 2 e_j^4$, the variance that the error $e$ of the reference adds to the mean,
+            with the bias $b$.
+
+    Returns:
+        The root-mean-square error, zero where the reference's error hides it, and the ends of its interval.
+
+    Raises:
+        ValueError: if `confidence` is not between 0 and 1.
+
+    References:
+        Satterthwaite. An approximate distribution of estimates of variance components. Biometrics Bulletin 2, 1946.
+    """
+    tail = (1 - checked(confidence)) / 2
+    squared_errors = np.asarray(squared_errors, float)
+    repeats = squared_errors.shape[-1]
+    mean = squared_errors.mean(axis=-1)
+    variance = squared_errors.var(axis=-1, ddof=1) / repeats + np.asarray(cross_variance, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = 2 * mean**2 / variance
+        ends = [mean * freedom / stats.chi2.isf(tail, freedom), mean * freedom / stats.chi2.ppf(tail, freedom)]
+    # All errors are equal up to rounding: the mean is known.
+    ends = np.where(freedom < 1e12, ends, mean)
+    taken_off = np.asarray(reference_variance, float)
+    return np.asarray(np.sqrt(np.maximum(mean - taken_off, 0))), np.sqrt(np.maximum(ends - taken_off, 0))
+
+
+class VarianceInterval(eqx.Module):
+    """A variance (the trace of the covariance with N − 1), the ends of its interval, and the method."""
+
+    value: float
+    ends: Float[np.ndarray, " 2"]
+    method: Literal["chi_square", "bootstrap"] = eqx.field(static=True)
+
+
+def variance_interval(samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95) -> VarianceInterval:
+    """Return the interval of a total variance, by chi-square or bootstrap, whichever suits the samples.
+
+    Chi-square is exact for normal samples of one coordinate and wrong for other distributions. For several coordinates its
+    degrees of freedom follow from the eigenvalues of the covariance. The bootstrap assumes no distribution but needs samples.
+    It is used from 20 samples on, if a kurtosis test rejects normality in some coordinate (5 % over all of them).
+
+    Samples that are not finite are left out; fewer than two give NaN.
+    """
+    tail = (1 - checked(confidence)) / 2
+    samples = np.asarray(samples, float)
+    samples = samples[np.isfinite(samples).all(axis=1)]
+    if len(samples) < 2:
+        return VarianceInterval(np.nan, np.full(2, np.nan), "chi_square")
+    covariance = np.atleast_2d(np.cov(samples, rowvar=False))
+    total = float(np.trace(covariance))
+    if _has_other_tails(samples):
+        ends = bootstrap_variance_interval(samples, confidence)
+        return VarianceInterval(total, ends, "bootstrap")
+    squares = (covariance**2).sum()
+    freedom = (len(samples) - 1) * (total**2 / squares if squares > 0 else 1.0)
+    return VarianceInterval(total, total * freedom / stats.chi2.isf([tail, 1 - tail], freedom), "chi_square")
+
+
+def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
+    """Return whether some coordinate has another kurtosis than a normal distribution."""
+    varied = samples[:, np.ptp(samples, axis=0) > 0]
+    if len(samples) < _FEWEST_FOR_BOOTSTRAP or varied.shape[1] == 0:
+        return False
+    return bool(stats.kurtosistest(varied).pvalue.min() < 0.05 / varied.shape[1])
