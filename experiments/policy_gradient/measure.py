@@ -258,8 +258,9 @@ class Problem:
     descent: Descent | None = None  # None if it is not optimised
 
     def objective(self, gradient: str, stddev: float) -> mg.Objective:
-        """Give the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""
-        return self.task.with_contact(mg.Onset() if gradient == ONSET else mg.Slope()).objective(jnp.asarray(stddev))
+        """Return the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""
+        contact = mg.Onset() if gradient == ONSET else mg.Discrete()
+        return self.task.with_contact(contact).objective(jnp.asarray(stddev))
 
 
 def problem(name: str, settings: Settings) -> Problem:
