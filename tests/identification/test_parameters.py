@@ -107,7 +107,7 @@ def test_the_derivative_by_ten_numbers_is_that_of_the_tensor(body):
 
     def there_and_back(numbers):
         fields = body_fields(pseudo_inertia(numbers))
-        rotation = rotation_matrix(fields["body_iquat"])
+        rotation = rotation_matrix(fields["body_iquat"][None])[0]
         about = rotation @ jnp.diag(jnp.sum(fields["body_inertia"]) / 2 - fields["body_inertia"]) @ rotation.T
         offset = jnp.append(fields["body_ipos"], 1.0)
         return fields["body_mass"] * jnp.outer(offset, offset) + jnp.pad(about, (0, 1))
