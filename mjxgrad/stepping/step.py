@@ -113,16 +113,26 @@ def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) 
         return _forward(model, data, contact)
 
 
-def _forward(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector | None = None) -> mjx.Data:
+def _forward(
+    model: mjx.Model,
+    data: mjx.Data,
+    contact: Contact,
+    after: _Vector | None = None,
+    rows: list[Block] | None = None,
+) -> mjx.Data:
     """Return data with all fields that depend on the state.
 
-    With `after`, the velocity after MuJoCo's step, the result has the derivative of `Slope`; its values are not used.
+    With `after`, the velocity after MuJoCo's step, the result has the derivative of `Slope`; its values are not used. With
+    `rows`, those of `_smooth`, the data is from there, too.
     """
+    if rows is None:
+        data, rows = _smooth(model, data)
     if isinstance(contact, Smoothing) and contact.mode == "backward":
-        own = _forward(*jax.lax.stop_gradient((model, data)), Discrete())
+        fixed, still, given = jax.lax.stop_gradient((model, data, rows))
+        own = _forward(fixed, still, Discrete(), rows=given)
         begun = data.replace(qacc_warmstart=own.qacc)
-        return jax.tree.map(_with_derivative_of, own, _forward(model, begun, replace(contact, mode="forward")))
-    data, rows = _smooth(model, data)
+        soft = _forward(model, begun, replace(contact, mode="forward"), rows=rows)
+        return jax.tree.map(_with_derivative_of, own, soft)
     layout, noise, solves = assembly.row_layout(model, data), None, None
     if isinstance(contact, Smoothing):
         rows, noise, layout = smoothed(model, data, rows, contact, layout)
