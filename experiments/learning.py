@@ -313,10 +313,8 @@ def _every(settings: Settings) -> int:
 
 
 def _stepped(environment: Environment, method: Method) -> Environment:
-    """Return the environment whose derivative is the method's."""
-    if method in ("discrete", "slope"):
-        return environment.with_contact(own_motion(method))
-    return environment
+    """Return the environment whose motion and derivative are the method's; those not named after one have an onset."""
+    return environment.with_contact(own_motion(method) if method in ("discrete", "slope") else mg.Onset())
 
 
 def _stiffer(environment: Environment, factor: float) -> mg.Softness:

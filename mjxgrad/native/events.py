@@ -115,6 +115,7 @@ class Surfaces:
         self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
         self.model = far = copy.deepcopy(model)
         far.geom_margin[:] += self.contact_reach / 2
+        far.flex_margin[:] += self.contact_reach / 2
         far.pair_margin[:] += self.contact_reach
         far.opt.o_margin += self.contact_reach
         far.jnt_margin[:] += self.limit_reach

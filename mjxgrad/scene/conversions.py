@@ -194,6 +194,7 @@ def kinematics_alone(model: mujoco.MjModel) -> mujoco.MjModel:
     ):
         kinds = getattr(bare, of)
         kinds[~np.isin(kinds, [int(kind) for kind in enumeration])] = used
+    bare.eq_type[~np.isin(bare.eq_type, [int(kind) for kind in mjx.EqType])] = mujoco.mjtEq.mjEQ_CONNECT
     list(drop_sensors(bare))
     return bare
 

@@ -9,7 +9,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -211,7 +211,7 @@ def _converted(
         stepped = copy.deepcopy(model)
         conversions += list(drop_sensors(stepped))
     except SceneError as error:
-        if engine == "mjx" or original.nflex:
+        if engine == "mjx":
             raise
         return original, kinematics_alone(original), [], str(error)
     return model, stepped, conversions, ""
@@ -243,6 +243,18 @@ def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
     return conversions
 
 
+class _Rigid:
+    """A model without its flexible bodies, whose vertices are bodies like others: MJX need not know what C MuJoCo does to them."""
+
+    nflex = 0
+
+    def __init__(self, model: mujoco.MjModel):
+        self._model = model
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._model, name)
+
+
 def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mjx.Model, mjx.Data]:
     """Return MJX's model and data."""
     if not contact_pairs(model):
@@ -256,7 +268,7 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
     try:
         # The device of this process; MJX would take the first of all processes.
         with np.errstate(over="raise"):
-            mjx_model = mjx.put_model(model, impl="jax", device=own_device())
+            mjx_model = mjx.put_model(_Rigid(model) if model.nflex else model, impl="jax", device=own_device())  # pyright: ignore[reportArgumentType]
         return mjx_model, _make_data(model, mjx_model, max_contacts)
     except FloatingPointError:
         largest = f"{np.finfo(np.float32).max:.1g}"

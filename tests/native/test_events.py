@@ -231,3 +231,23 @@ def test_a_cylinder_that_stands_on_a_box_has_the_slope_as_mean():
     found = compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
     assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope))
     assert np.all(found.spread[0] < 0.1 * np.abs(found.slope).max())
+
+
+CLOTH = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><flexcomp name="cloth" type="grid" count="2 2 1" spacing=".1 .1 .1"
+    pos="0 0 .14" euler="12 7 0" radius=".02" mass=".5" dim="2"><edge equality="true"/></flexcomp></worldbody></mujoco>"""
+
+
+def test_a_cloth_that_lands_has_the_slope_as_mean():
+    """Its vertices are bodies that slide, and its contacts have no geom on its side."""
+    scene = mg.load_scene(CLOTH)
+    speeds = jnp.tile(jnp.array([0.3, 0.0, -1.0]), 4)
+
+    def outcome(place):
+        start = mg.initial_state(scene, qvel=speeds.at[2::3].add(place))
+        return mg.rollout(scene, start, horizon=60, contact=mg.Slope()).qpos[-1, jnp.array([0, 2])]
+
+    parameters = phases((-0.3, 0.3), 65)
+    outcomes, derivatives = jax.jit(jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,))))(jnp.asarray(parameters))
+    found = compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
+    assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope))
+    assert np.all(found.mean_error[0] < 0.2 * np.abs(found.slope).max())

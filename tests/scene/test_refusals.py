@@ -146,7 +146,7 @@ def test_refusal_names_the_culprit_and_the_remedy(feature):
     assert remedy in message
 
 
-@pytest.mark.parametrize("feature", [feature for feature in REFUSED if feature != "flex"])
+@pytest.mark.parametrize("feature", REFUSED)
 def test_what_mjx_lacks_c_mujoco_steps_as_it_is_in_the_file(feature):
     source, culprit, _ = REFUSED[feature]
     with pytest.warns(SceneWarning, match="C MuJoCo steps it"):
