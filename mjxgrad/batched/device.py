@@ -10,7 +10,7 @@ uses them all.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -65,16 +65,13 @@ def _is_shared_out(context: mlir.LoweringRuleContext) -> bool:
     return getattr(axes, "num_devices", 1) > 1
 
 
-def over_devices(
-    function: Callable[..., Any], devices: Sequence[jax.Device] | None = None, *, num_shared: int = 0
-) -> Callable[..., Any]:
-    """Return `jax.vmap(function)` whose batch is split evenly over devices.
+def over_devices(function: Callable[..., Any], *, num_shared: int = 0) -> Callable[..., Any]:
+    """Return `jax.vmap(function)` whose batch is split evenly over all devices of the default platform.
 
     The devices exchange nothing. With one device the result is `jax.vmap(function)`.
 
     Args:
         function: a function of one member of the batch; its arguments are pytrees of arrays with the batch as leading axis.
-        devices: the devices to use; by default all of the default platform.
         num_shared: number of leading arguments that all members share; they have no batch axis.
 
     Raises:
@@ -84,7 +81,7 @@ def over_devices(
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
         batched = jax.vmap(function, in_axes=tuple(None if i < num_shared else 0 for i in range(len(args))))
-        own = all_devices() if devices is None else list(devices)
+        own = all_devices()
         if len(own) == 1:
             return batched(*args)
         sizes = {np.shape(x)[:1] for x in jax.tree.leaves(args[num_shared:])}

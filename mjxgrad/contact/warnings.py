@@ -27,20 +27,14 @@ def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) 
     if integrator != mujoco.mjtIntegrator.mjINT_RK4:
         # The difference of two large numbers, in a form that does not cancel.
         return 2.0 / (np.sqrt(1.0 + damping_ratio**2) + damping_ratio)
+    root = np.emath.sqrt(damping_ratio**2 - 1.0)
     stable, unstable = 0.0, 3.0
     for _ in range(50):
         middle = (stable + unstable) / 2
-        if _runge_kutta_growth(middle, damping_ratio) <= 1.0:
-            stable = middle
-        else:
-            unstable = middle
+        z = middle * np.array([-damping_ratio + root, -damping_ratio - root])
+        is_stable = np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24).max() <= 1.0
+        stable, unstable = (middle, unstable) if is_stable else (stable, middle)
     return stable
-
-
-def _runge_kutta_growth(step: float, damping_ratio: float) -> float:
-    root = np.emath.sqrt(damping_ratio**2 - 1.0)
-    z = step * np.array([-damping_ratio + root, -damping_ratio - root])
-    return float(np.abs(1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24).max())
 
 
 def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[str]:
@@ -67,12 +61,10 @@ def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -
     """Return one sentence per kind of pair for which MJX and C MuJoCo find different contact points."""
     geom = mujoco.mjtGeom
     kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
+    boxes = "box on box: MJX keeps four points, C MuJoCo up to eight; where two edges meet MJX takes a point of a face"
     known = (
         ({geom.mjGEOM_PLANE, geom.mjGEOM_MESH}, "mesh on plane: MJX keeps only corners within 1 mm of the deepest one"),
-        (
-            {geom.mjGEOM_BOX},
-            "box on box: MJX keeps four points, C MuJoCo up to eight; where two edges meet MJX takes a point of a face",
-        ),
+        ({geom.mjGEOM_BOX}, boxes),
         ({geom.mjGEOM_CAPSULE}, "parallel capsules: MJX makes one contact, C MuJoCo two"),
     )
     return [message for kind, message in known if kind in kinds]

@@ -28,9 +28,7 @@ class BraxEnv(Env):
 
     def reset(self, rng: PRNGKeyArray | UInt32[Array, "2"]) -> State:
         key = rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
-        copy_key, reset_key = jax.random.split(key)
-        changes = self.environment.changes(copy_key)
-        physics = self.environment.with_changes(changes).reset(reset_key)
+        changes, physics = self.environment.begin(key)
         return _brax_state(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: Float[Array, " nu"]) -> State:

@@ -16,10 +16,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.bodies.spatial import exponential, multiply, rotation_matrix
 from mjxgrad.envs.environment import Environment
-from mjxgrad.envs.gymnasium_robots import robot_scene
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.tasks.action_task import scene_path
+from mjxgrad.tasks.action_task import robot_scene, scene_path
 
 Memory = dict[str, Float[Array, "..."]]
 _TILT = jnp.pi / 24  # rad, largest tilt of a floating base at the start

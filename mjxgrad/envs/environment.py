@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
 from mjxgrad.objective.task import InScene, optional_pytree
-from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
+from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
@@ -164,7 +164,8 @@ class Environment(InScene):
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
         action = jnp.clip(action, -1, 1)
         key, memory_key = jax.random.split(state.key)
-        course = self._move(self.disturbed(state.physics, state.memory), self.control(action))
+        controls = jnp.broadcast_to(self.control(action), (self.frame_skip, self.num_actions))
+        course = rollout(self.scene, self.disturbed(state.physics, state.memory), controls, contact=self.contact)
         after = course.final
         terms = self.rewards(state.physics, action, after, state.memory)
         memory = self.next_memory(state.memory, action, after, memory_key)
@@ -181,14 +182,6 @@ class Environment(InScene):
             num_steps=num_steps,
             memory=memory,
             key=key,
-        )
-
-    def _move(self, physics: State, ctrl: Float[Array, " nu"]) -> Trajectory:
-        return rollout(
-            self.scene,
-            physics,
-            jnp.broadcast_to(ctrl, (self.frame_skip, self.num_actions)),
-            contact=self.contact,
         )
 
     def step_on(self, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
@@ -236,3 +229,9 @@ class Environment(InScene):
         """Return the copy with its own numbers, as drawn by `changes`."""
         own, structure = jax.tree.flatten(self)
         return structure.unflatten([x if new is None else new for x, new in zip(own, changes, strict=True)])
+
+    def begin(self, key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
+        """Return the changes of one copy, and the start of its first episode."""
+        copy_key, reset_key = jax.random.split(key)
+        changes = self.changes(copy_key)
+        return changes, self.with_changes(changes).reset(reset_key)

@@ -68,7 +68,7 @@ class GymEnv(_Adapter, gymnasium.Env):
         """
         self._prepare(environment, render_mode, view)
         self.observation_space, self.action_space = self._spaces()
-        self._begin = jax.jit(lambda key: _begin(self.environment, key))
+        self._begin = jax.jit(lambda key: self.environment.begin(key))
         self._advance = jax.jit(
             lambda changes, state, action: self.environment.with_changes(changes).step(state, action)
         )
@@ -108,7 +108,7 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
         def begin(key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
-            return jax.vmap(lambda one: _begin(self.environment, one))(jax.random.split(key, num_envs))
+            return jax.vmap(self.environment.begin)(jax.random.split(key, num_envs))
 
         def advance(changes: PyTree, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
             return self.environment.with_changes(changes).step_on(state, action)
@@ -148,11 +148,10 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
 def register() -> None:
     """Register `ENVIRONMENTS` with gymnasium."""
     for name in ENVIRONMENTS:
-        place = f"{__name__}:"
         gymnasium.register(
             gym_name(name),
-            entry_point=f"{place}{GymEnv.__name__}",
-            vector_entry_point=f"{place}{GymVectorEnv.__name__}",
+            entry_point=f"{__name__}:{GymEnv.__name__}",
+            vector_entry_point=f"{__name__}:{GymVectorEnv.__name__}",
             kwargs={"environment": name},
         )
 
@@ -161,12 +160,6 @@ def gym_name(name: str) -> str:
     """Return gymnasium's name of one of `ENVIRONMENTS`: `diffrl_ant` is `mjxgrad/DiffRLAnt-v0`."""
     words = ["DiffRL" if word == "diffrl" else word.capitalize() for word in name.split("_")]
     return f"mjxgrad/{''.join(words)}-v0"
-
-
-def _begin(environment: Environment, key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
-    copy_key, reset_key = jax.random.split(key)
-    changes = environment.changes(copy_key)
-    return changes, environment.with_changes(changes).reset(reset_key)
 
 
 def _key(generator: np.random.Generator) -> PRNGKeyArray:

@@ -7,19 +7,16 @@ References:
     Towers et al. Gymnasium: A Standard Interface for Reinforcement Learning Environments. arXiv:2407.17032.
 """
 
-from pathlib import Path
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.envs.environment import Environment
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.rollouts.state import data_of
-from mjxgrad.scene import Scene, load_scene
+from mjxgrad.tasks.action_task import robot_scene
 
 _ANY = (-float("inf"), float("inf"))
 
@@ -154,28 +151,6 @@ def humanoid() -> Robot:
         noise=1e-2,
         by_mass=True,
     )
-
-
-def robot_scene(name: str, *, timestep: float | None = None, max_contacts: int | None = None) -> Scene:
-    """Load one of gymnasium's robots, to be stepped by Euler's method.
-
-    Args:
-        name: name of the file without its ending.
-        timestep: time step in s, in place of the file's.
-        max_contacts: see `load_scene`.
-
-    Raises:
-        ImportError: if gymnasium is not installed.
-    """
-    # Imported here: only these robots need it.
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise ImportError(f"{name} is gymnasium's, not installed: pip install 'mjxgrad[envs]'") from error
-    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{name}.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    return load_scene(model, timestep=timestep, max_contacts=max_contacts)
 
 
 def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], dtype) -> Float[Array, "*shape"]:

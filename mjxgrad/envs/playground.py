@@ -3,10 +3,9 @@
 Both call `mjx.step`. It is replaced by `mg.step` while their `reset` and `step` run, and restored after. Nothing else changes.
 """
 
-import contextlib
 import functools
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import mujoco.mjx
@@ -20,7 +19,6 @@ _LOCK = threading.RLock()
 
 def load(
     name: str,
-    config: Any = None,
     config_overrides: Mapping[str, Any] | None = None,
     *,
     contact: Contact = Discrete(),
@@ -33,7 +31,6 @@ def load(
 
     Args:
         name: name for `registry.load`, for instance "CartpoleSwingup".
-        config: Playground's configuration; None is the default.
         config_overrides: values by flattened name; `impl` is always "jax", the implementation that has derivatives.
         contact: how contact is stepped, see `mg.step`.
         iterations: see `stepped_right`.
@@ -48,18 +45,10 @@ def load(
     except ImportError as error:
         raise ImportError(f"{name} is MuJoCo Playground's, not installed: pip install 'mjxgrad[playground]'") from error
     overrides = {**(config_overrides or {}), "impl": "jax"}
-    # A copy, because the overrides change the configuration in place.
-    own = None if config is None else config.copy_and_resolve_references()
-    environment = registry.load(name, own, overrides)
-    return stepped_right(environment, contact=contact, iterations=iterations)
+    return stepped_right(registry.load(name, None, overrides), contact=contact, iterations=iterations)
 
 
-def stepped_right(
-    environment: Foreign,
-    *,
-    contact: Contact = Discrete(),
-    iterations: int = 100,
-) -> Foreign:
+def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterations: int = 100) -> Foreign:
     """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`.
 
     Args:
@@ -90,26 +79,17 @@ def _step(iterations: int, model: mjx.Model, data: mjx.Data, **settings: Any) ->
 
 
 def _within(method: Callable, own_step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Callable:
+    """Return a method during which `mjx.step` is replaced, in its thread."""
+
     @functools.wraps(method)
     def call(*args: Any, **kwargs: Any) -> Any:
-        with _substituted(own_step):
-            return method(*args, **kwargs)
+        # One thread at a time: two interleaved threads would restore each other's substitute.
+        with _LOCK:
+            original, thread = mujoco.mjx.step, threading.get_ident()
+            mujoco.mjx.step = lambda *given: (own_step if threading.get_ident() == thread else original)(*given)
+            try:
+                return method(*args, **kwargs)
+            finally:
+                mujoco.mjx.step = original
 
     return call
-
-
-@contextlib.contextmanager
-def _substituted(own_step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Iterator[None]:
-    """Replace `mjx.step` within the block, in this thread."""
-    # One thread at a time: two interleaved threads would restore each other's substitute.
-    with _LOCK:
-        original, thread = mujoco.mjx.step, threading.get_ident()
-
-        def substitute(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-            return (own_step if threading.get_ident() == thread else original)(model, data)
-
-        mujoco.mjx.step = substitute
-        try:
-            yield
-        finally:
-            mujoco.mjx.step = original

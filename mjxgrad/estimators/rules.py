@@ -149,25 +149,23 @@ class BiasConstrained(eqx.Module):
 
 
 class Concavity(eqx.Module):
-    r"""Inverse variance if $V^1 + \varepsilon \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
+    r"""Inverse variance if $V^1 \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
 
     A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. A cost with jumps has
     too much variance for its derivatives.
 
     Attributes:
         slack: $c$.
-        tolerance: $\varepsilon$, in squared cost.
 
     References:
         Onoda et al., arXiv:2604.18161 (DDCG), here with the noise of each coordinate in its own standard deviations.
     """
 
     slack: float = 0.3
-    tolerance: float = 0.0
 
     def __call__(self, evidence: Evidence) -> Weights:
         needed = 2 * (1 - self.slack) * evidence.cost_variance - 2 * evidence.scaled_first_norm**2
-        is_smooth = evidence.scaled_first_variance + self.tolerance >= needed
+        is_smooth = evidence.scaled_first_variance >= needed
         alpha = jnp.where(is_smooth, evidence.least_variance(), 0)
         reason = Reason.where(is_smooth, Reason.inverse_variance, Reason.inconsistent)
         return Weights(alpha, reason, jnp.where(alpha > 0, jnp.nan, 0))

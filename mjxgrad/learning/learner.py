@@ -87,7 +87,8 @@ class ActorCritic(Method):
         actor_key, critic_key, start_key, spread_key, model_key, next_key = jax.random.split(start, 6)
         settings, count = self.settings, self.settings.num_environments
         model_keys = jax.random.split(model_key, count)
-        environments = self._starts(model_keys, start_key)
+        starts = jax.vmap(lambda model_key, key: self.environment.randomised(model_key).reset(key))
+        environments = starts(model_keys, jax.random.split(start_key, count))
         # Otherwise all episodes would end together, and an update would see only one part of them.
         spread = jax.random.randint(spread_key, (count,), 0, self.environment.episode_length)
         environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
@@ -149,14 +150,6 @@ class ActorCritic(Method):
     def identity(self) -> dict[str, Any]:
         name = type(self.environment).__qualname__
         return {"settings": repr(self.settings), "num_updates": self.num_updates, "environment": name}
-
-    def _starts(self, model_keys: Key[Array, " environments"], key: PRNGKeyArray) -> EnvState:
-        """Return the start of an episode in each copy."""
-
-        def start(model_key: PRNGKeyArray, key: PRNGKeyArray) -> EnvState:
-            return self.environment.randomised(model_key).reset(key)
-
-        return jax.vmap(start)(model_keys, jax.random.split(key, len(model_keys)))
 
     def _windows(
         self, learner: Learner, environments: EnvState, key: PRNGKeyArray, stddev: Float[Array, ""]

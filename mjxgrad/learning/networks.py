@@ -46,12 +46,7 @@ class Network(eqx.Module):
 
 
 class Normaliser(eqx.Module):
-    """A normalisation of observations by the mean and variance of all observations so far.
-
-    References:
-        Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample variances. COMPSTAT 1982,
-        equation 2.1.
-    """
+    """A normalisation of observations by the mean and variance of all so far, merged as in `estimators.moments`."""
 
     count: Float[Array, ""]
     mean: Float[Array, " obs"]

@@ -12,8 +12,7 @@ the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the rec
 compared and mixed by step and action, and a derivative that is not finite is found where it arises.
 
 References:
-    Xu et al. Accelerated Policy Learning with Parallel Differentiable Simulation. ICLR 2022, arXiv:2204.07137 (the window).
-    Onoda et al., arXiv:2604.18161 (the mixture by step).
+    Those of `learn`: Xu et al. for the window, Onoda et al. for the mixture by step.
 """
 
 import dataclasses
@@ -89,16 +88,8 @@ class Gradients(eqx.Module):
 
 def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:
     r"""Return the return $J$ of a window."""
-    following = window.next_values(value)
-    is_last = window.done.at[-1].set(True)
-
-    def add(weight: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        reward, after, is_over = now
-        part = weight * (reward + jnp.where(is_over, discount * after, 0))
-        return jnp.where(is_over, 1.0, discount * weight), part
-
-    one = jnp.ones((), window.rewards.dtype)
-    return jax.lax.scan(add, one, (window.rewards, following, is_last))[1].sum()
+    after = jnp.where(window.done.at[-1].set(True), discount * window.next_values(value), 0)
+    return (weights_in_return(window, discount) * (window.rewards + after)).sum()
 
 
 def lambda_returns(window: Window, value: Value, discount: float, trace: float) -> Float[Array, " steps"]:
@@ -137,12 +128,10 @@ def run_window(
     actor: Network,
     normaliser: Normaliser,
     noise: Float[Array, "steps nu"],
-    change: Float[Array, "steps nu"] | None = None,
 ) -> tuple[Window, EnvState]:
-    """Run a policy for one step per row of noise.
+    """Run a policy for one step per row of noise, which is added to actions before squashing.
 
-    The noise is added to actions before squashing, and so is `change`, to differentiate by. The next window starts from the
-    returned state.
+    The next window starts from the returned state.
     """
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
@@ -151,7 +140,7 @@ def run_window(
         ends = (stepped.terminated, stepped.truncated)
         return following, Window(state.obs, stepped.obs, stepped.reward, *ends, stepped.metrics)
 
-    final, window = jax.lax.scan(advance, state, noise if change is None else noise + change)
+    final, window = jax.lax.scan(advance, state, noise)
     return window, final
 
 
@@ -177,7 +166,7 @@ def window_gradients(
         return critic(normaliser(obs))[0]
 
     def gain(change: Float[Array, "steps nu"]):
-        window, final = run_window(copy, state, actor, normaliser, stddev * noise, change)
+        window, final = run_window(copy, state, actor, normaliser, stddev * noise + change)
         return returned(window, value, discount), (window, final)
 
     first, (window, final) = jax.grad(gain, has_aux=True)(jnp.zeros_like(noise))

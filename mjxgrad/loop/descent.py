@@ -27,10 +27,6 @@ NUM_SEGMENTS = 20
 STILL_STEPS = 3
 
 
-def _as_path(path: str | Path | None) -> Path | None:
-    return None if path is None else Path(path)
-
-
 class RunOptions(eqx.Module):
     """The options of every descent.
 
@@ -52,7 +48,7 @@ class RunOptions(eqx.Module):
     evaluate_every: int = 10
     patience: int = 10
     log: Log | None = None
-    checkpoint: Path | None = eqx.field(default=None, converter=_as_path)
+    checkpoint: Path | None = eqx.field(default=None, converter=lambda path: None if path is None else Path(path))
 
     def __check_init__(self):
         for name in ("num_steps", "evaluate_every", "patience"):

@@ -200,9 +200,8 @@ def estimated_gradient(
 
     Returns:
         A transformation of a vector, or of a pytree as in `optimise`. The updates that it is given are added to the
-        estimate: the gradient of anything else in the cost, or None. Its `update` takes two further arguments, `key` and
-        `objective`, that replace its own for that update. Where the estimate is not finite the update is zero, and
-        `num_skipped` counts it.
+        estimate: the gradient of anything else in the cost, or None. Where the estimate is not finite the update is zero,
+        and `num_skipped` counts it.
 
     Raises:
         ValueError: if `objective` and `annealing` do not belong together.
@@ -219,16 +218,15 @@ def estimated_gradient(
             return scale, estimator(annealed, vector, key)
 
         zero = jnp.zeros((), jnp.int32)
-        scale, estimate = jax.tree.map(_nothing, jax.eval_shape(first, vector, key, zero))
+        shapes = jax.eval_shape(first, vector, key, zero)
+        nothing = lambda x: jnp.full(x.shape, jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else 0, x.dtype)  # noqa: E731
+        scale, estimate = jax.tree.map(nothing, shapes)
         return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(vector))
 
     def update(
         updates: PyTree,
         state: EstimatedGradientState,
         params: PyTree = None,
-        *,
-        key: PRNGKeyArray = key,
-        objective: Objective | AnnealedObjective = objective,
         **unused: Any,
     ) -> tuple[PyTree, EstimatedGradientState]:
         del unused  # extra arguments of others in a chain
@@ -243,7 +241,3 @@ def estimated_gradient(
         return change if restore is None else eqx.filter(restore(change), eqx.is_inexact_array), moved
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
-
-
-def _nothing(leaf: jax.ShapeDtypeStruct) -> Array:
-    return jnp.full(leaf.shape, jnp.nan if jnp.issubdtype(leaf.dtype, jnp.floating) else 0, leaf.dtype)

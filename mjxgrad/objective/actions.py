@@ -214,20 +214,17 @@ def closed_loop(
 
     The action is $u_t = \pi_\theta(x_t) + w_t$. The score of a rollout is
     $\sum_t (\partial\pi_\theta(x_t)/\partial\theta)^\top w_t/\sigma^2$, with the states taken as data.
-    Value and score come from one rollout. Where the task has a distribution of starts, every rollout draws its own.
+    Value and score come from one rollout. Starts, `task`, `stddev` and errors are as for `open_loop`.
 
     Args:
         task: the controlled task with its cost.
         policy: function from its parameters and a state to controls of shape (nu,).
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
+        stddev: standard deviation of the noise.
         params: an example of the policy's parameters, such as a dict or an equinox module. Only the shapes of its
             floating-point arrays count; all other leaves are kept. Without it the policy gets the flat vector itself.
 
     Returns:
         The objective; `objective.ravel` and `objective.unravel` convert the policy's parameters to the flat vector and back.
-
-    Raises:
-        ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
 
     References:
         Williams. Simple statistical gradient-following algorithms for connectionist

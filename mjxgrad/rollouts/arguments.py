@@ -37,8 +37,15 @@ def sequence_of(
     sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
     for name, value in (("controls", sequence), ("noise", noise)):
-        if value is not None:
-            _check_sequence(name, jnp.asarray(value), (horizon, num_controls))
+        if value is None:
+            continue
+        if jnp.shape(value) != (horizon, num_controls):
+            meaning = "one row per step and one column per actuator"
+            raise ValueError(f"{name} must have shape {(horizon, num_controls)}, {meaning}, got {jnp.shape(value)}")
+        numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
+        if numbers is not None and not np.isfinite(numbers).all():
+            row, column = np.argwhere(~np.isfinite(numbers))[0]
+            raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")
     return sequence, horizon
 
 
@@ -94,14 +101,3 @@ def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
     if length < 1:
         raise ValueError(f"horizon must be at least 1, got {length}")
     return length
-
-
-def _check_sequence(name: str, value: Array, shape: tuple[int, int]) -> None:
-    if value.shape != shape:
-        meaning = "one row per step and one column per actuator"
-        raise ValueError(f"{name} must have shape {shape}, {meaning}, got {value.shape}")
-    numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
-    if numbers is None or np.isfinite(numbers).all():
-        return
-    row, column = np.argwhere(~np.isfinite(numbers))[0]
-    raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")

@@ -65,10 +65,13 @@ class _Scan:
     def begin(self, state: State) -> _Carry:
         """Return the carry of the first step."""
         looks = self.policy is not None and self.settings.policy_sees == "observations"
+        # A NaN in the contacts of a traced model would go unnoticed.
+        traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
+        has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
         return _Carry(
             state,
             self.scene.data.ctrl if looks else None,
-            jnp.where(_has_numbers(self.scene), jnp.int32(-1), jnp.int32(0)),
+            jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)),
             jnp.zeros((), jnp.int32),
             jnp.zeros((), jnp.int32),
             direction(state) if self.settings.measure_growth else None,
@@ -165,12 +168,6 @@ def rolled_out(
 
 
 rolled_out_compiled = compiled(rolled_out)
-
-
-def _has_numbers(scene: Scene) -> Bool[Array, ""]:
-    """Whether traced fields of a model are numbers: a NaN in a contact would go unnoticed."""
-    traced = [x for x in numbers_of(scene.model).values() if isinstance(x, jax.core.Tracer)]
-    return jnp.array(True) if not traced else ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced]))
 
 
 def _is_crowded(model: mjx.Model, data: mjx.Data, contact: Contact) -> Bool[Array, ""]:

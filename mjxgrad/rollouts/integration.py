@@ -16,7 +16,7 @@ References:
 """
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -42,7 +42,6 @@ class AdaptiveTrajectory(eqx.Module):
         qpos: positions at these times, quaternions normalised.
         qvel: velocities at these times.
         num_steps: number of all steps, including rejected ones.
-        num_rejected: number of rejected steps.
         has_failed: whether the steps ran out, or the state ceased to be finite; the states are then without meaning.
     """
 
@@ -50,7 +49,6 @@ class AdaptiveTrajectory(eqx.Module):
     qpos: Float[Array, "times nq"]
     qvel: Float[Array, "times nv"]
     num_steps: Int[Array, ""]
-    num_rejected: Int[Array, ""]
     has_failed: Bool[Array, ""]
 
 
@@ -58,13 +56,11 @@ def adaptive_rollout(
     scene: Scene,
     state: State,
     times: Float[ArrayLike, " times"] | Sequence[float],
-    controls: Callable[[Float[Array, ""]], Float[Array, " nu"]] | None = None,
     *,
     tolerance: Float[ArrayLike, ""] = 1e-6,
-    solver: Any = None,
     max_steps: int = 16384,
 ) -> AdaptiveTrajectory:
-    """Integrate a scene with error control.
+    """Integrate a scene under its resting controls, with error control.
 
     Differentiable in reverse mode; see the module for the limits of the derivative. Needs diffrax
     (`pip install 'mjxgrad[adaptive]'`).
@@ -73,10 +69,7 @@ def adaptive_rollout(
         scene: from `load_scene`. Its integrator is not used; its time step only where `refsafe` clamps contact parameters.
         state: the initial state.
         times: output times since the start, increasing (s).
-        controls: function from the time since the start to controls; None for the scene's resting ones.
         tolerance: relative and absolute tolerance on the error of a step.
-        solver: explicit solver of diffrax; None is `diffrax.Bosh3()`, of third order: contact forces are not smooth enough
-            for more.
         max_steps: largest number of steps. Memory in reverse mode grows with its square root.
 
     Returns:
@@ -100,16 +93,15 @@ def adaptive_rollout(
 
     def vector_field(t: Float[Array, ""], y: Rates, _: None) -> Rates:
         qpos, qvel, act = y
-        ctrl = scene.data.ctrl if controls is None else controls(t)
         now = State(qpos, qvel, act, state.time + t, state.warmstart)
-        data = forward(scene.model, data_of(scene, now, ctrl))
+        data = forward(scene.model, data_of(scene, now, scene.data.ctrl))
         zero = jnp.zeros((), qpos.dtype)
         carried = jax.jvp(lambda s: integrate_position(scene.model, qpos, qvel, s), (zero,), (zero + 1,))[1]
         return carried, data.qacc, data.act_dot
 
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(vector_field),
-        diffrax.Bosh3() if solver is None else solver,
+        diffrax.Bosh3(),  # of third order: contact forces are not smooth enough for more
         t0=jnp.zeros_like(moments[0]),
         t1=moments[-1],
         dt0=None,
@@ -127,6 +119,5 @@ def adaptive_rollout(
         qpos=normalised,
         qvel=qvel,
         num_steps=jnp.asarray(solution.stats["num_steps"]),
-        num_rejected=jnp.asarray(solution.stats["num_rejected_steps"]),
         has_failed=has_failed,
     )

@@ -33,11 +33,7 @@ class Linearisation(eqx.Module):
 
 
 def linearise(
-    scene: Scene,
-    state: State,
-    ctrl: Float[ArrayLike, " nu"] | None = None,
-    *,
-    contact: Contact = Slope(),
+    scene: Scene, state: State, ctrl: Float[ArrayLike, " nu"] | None = None, *, contact: Contact = Slope()
 ) -> Linearisation:
     """Return the linear model of one step; use `jax.vmap` for a batch of states.
 
@@ -69,9 +65,8 @@ def linearise(
             act=state.act + change[2 * nv : size],
         )
         found = step(scene.model, data, contact=contact)
-        return jnp.concatenate(
-            [position_change(scene.model, end.qpos, found.qpos), found.qvel, found.act]
-        ), found.sensordata
+        change = position_change(scene.model, end.qpos, found.qpos)
+        return jnp.concatenate([change, found.qvel, found.act]), found.sensordata
 
     of_state, of_sensors = jax.jacfwd(moved)(jnp.zeros(size + scene.model.nu, state.qvel.dtype))
     return Linearisation(of_state[:, :size], of_state[:, size:], of_sensors[:, :size], of_sensors[:, size:])

@@ -70,9 +70,13 @@ def frames(
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
     data = mujoco.MjData(mj_model)
     view = -1 if camera is None else camera
+    last, states_per_frame = len(positions) - 1, speed / fps / timestep
+    # The last state counts as reached despite rounding in its time.
+    shown = np.arange(int(last / states_per_frame + 1e-6) + 1)
+    nearest = np.minimum(np.rint(shown * states_per_frame).astype(int), last)
     drawn = []
     with _renderer(mj_model, height, width) as renderer:
-        for state in _nearest(len(positions), timestep, speed / fps):
+        for state in nearest:
             data.qpos[:] = positions[state]
             mujoco.mj_fwdPosition(mj_model, data)
             renderer.update_scene(data, view)
@@ -124,14 +128,6 @@ def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) 
     if not np.isfinite(positions).all():
         bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
         raise ValueError(f"qpos must be finite, got a value that is not in state {bad}; draw the states before it")
-
-
-def _nearest(num_states: int, timestep: Number, interval: Number) -> np.ndarray:
-    """Return the index of the state nearest to each frame's time."""
-    # The last state counts as reached despite rounding in its time.
-    num_frames = int((num_states - 1) * timestep / interval + 1e-6) + 1
-    times = np.arange(num_frames) * interval
-    return np.minimum(np.rint(times / timestep).astype(int), num_states - 1)
 
 
 # A broken driver may end the process that tries it, so a subprocess does.

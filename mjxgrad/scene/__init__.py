@@ -1,8 +1,7 @@
 """Scenes that MJX can step, from MJCF: their contents, conversions and omissions."""
 
-from mjxgrad.scene.conversions import Conversion
+from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.load import load_scene
-from mjxgrad.scene.omissions import Omission
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, sensor, site_position
 
 __all__ = [

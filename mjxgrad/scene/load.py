@@ -27,8 +27,8 @@ from mjxgrad.scene.conversions import (
     Conversion,
     drop_sensors,
     kinematics_alone,
+    switch_off,
 )
-from mjxgrad.scene.omissions import switch_off
 from mjxgrad.scene.refusals import refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
@@ -156,14 +156,6 @@ def _parse(read, argument: str | mujoco.MjSpec, name: str) -> tuple[mujoco.MjMod
         raise SceneError(f"{name} must be MJCF that MuJoCo accepts, but it says: {message}") from (error)
 
 
-def _refuse_many_pairs(model: mujoco.MjModel, name: str) -> None:
-    if count_pairs(model) > MOST_PAIRS:
-        raise SceneError(
-            f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "
-            "touch contype and conaffinity that do not match; then max_contacts bounds those that do"
-        )
-
-
 def count_pairs(model: mujoco.MjModel) -> int:
     """Count the pairs of geoms that can touch, up to one more than `MOST_PAIRS`."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
@@ -201,7 +193,11 @@ def _converted(
     try:
         if engine == "mujoco":
             raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
-        _refuse_many_pairs(model, name)
+        if count_pairs(model) > MOST_PAIRS:
+            raise SceneError(
+                f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "
+                "touch contype and conaffinity that do not match; then max_contacts bounds those that do"
+            )
         if mujoco.__version__.split(".")[:2] != MJX_VERSION.split(".")[:2]:
             raise SceneError(
                 f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "

@@ -17,6 +17,7 @@ _OBJECT = mujoco.mjtObj
 _ENABLE = mujoco.mjtEnableBit
 _DISABLE = mujoco.mjtDisableBit
 _GEOM = mujoco.mjtGeom
+_SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
 _SEARCHED = (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER)
 
 
@@ -61,9 +62,10 @@ def _when(condition: Callable[[mujoco.MjModel], bool], given: str | Callable):
     return find
 
 
-def _integrator(member: mujoco.mjtIntegrator):
-    name = member.name.removeprefix("mjINT_").lower()
-    return _when(lambda m: m.opt.integrator == member, f"integrator={name!r}")
+def _integrator(model: mujoco.MjModel) -> Iterator[str]:
+    kind = mujoco.mjtIntegrator(model.opt.integrator)
+    if kind in (kind.mjINT_IMPLICIT, kind.mjINT_DISCRETE):
+        yield f"integrator={kind.name.removeprefix('mjINT_').lower()!r}"
 
 
 def _flag(member: mujoco.mjtEnableBit):
@@ -156,11 +158,6 @@ def _without_width(model: mujoco.MjModel) -> Iterator[str]:
             yield f"{field} of {element_name(model, kind, i)}"
 
 
-def _is_scalar_joint(model: mujoco.MjModel) -> np.ndarray:
-    joint = mujoco.mjtJoint
-    return np.isin(model.jnt_type, [joint.mjJNT_SLIDE.value, joint.mjJNT_HINGE.value])
-
-
 def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
     group = model.actuator_group
     in_range = (group >= 0) & (group < 31)
@@ -182,8 +179,7 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
     ("exact contact of cylinders and ellipsoids with each other and capsules, and of ellipsoids with spheres",
      _searched_pairs, "use capsules, spheres or boxes, or exclude the pair by contype and conaffinity or <contact><exclude>"),
     ("margin in contacts of meshes and height fields", _margins_of_meshes, "set margin='0' on both geoms"),
-    ("integrator 'implicit'", _integrator(mujoco.mjtIntegrator.mjINT_IMPLICIT), "use 'implicitfast', 'Euler' or 'RK4'"),
-    ("integrator 'discrete'", _integrator(mujoco.mjtIntegrator.mjINT_DISCRETE), "use 'implicitfast', 'Euler' or 'RK4'"),
+    ("such integrator", _integrator, "use 'implicitfast', 'Euler' or 'RK4'"),
     ("override of contact parameters", _flag(_ENABLE.mjENBL_OVERRIDE),
      "write o_solref, o_solimp, o_friction and half of o_margin into <default><geom>"),
     ("exact constraint diagonal", _flag(_ENABLE.mjENBL_DIAGEXACT), _DIRECTLY),
@@ -240,7 +236,7 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
      "give two positive numbers (time constant, damping ratio) or two that are not (−stiffness, −damping)"),
     ("joint limit that acts on both ends at once",
      _where(_OBJECT.mjOBJ_JOINT,
-            lambda m: m.jnt_limited & _is_scalar_joint(m) & (2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1))),
+            lambda m: m.jnt_limited & np.isin(m.jnt_type, _SCALAR) & (2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1))),
      "make the joint's margin smaller than half its range"),
     ("tendon limit that acts on both ends at once",
      _where(_OBJECT.mjOBJ_TENDON, lambda m: m.tendon_limited & (2 * m.tendon_margin > np.ptp(m.tendon_range, axis=1))),

@@ -22,8 +22,8 @@ from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings
-from mjxgrad.scene.conversions import Conversion
-from mjxgrad.scene.omissions import Omission, has_medium
+from mjxgrad.scene.conversions import Conversion, Omission
+from mjxgrad.scene.refusals import has_medium
 from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
@@ -335,15 +335,9 @@ def _numbers(values) -> list[str]:
 
 def _friction(condim: int, friction: Sequence[float]) -> str:
     """Return the sliding, torsional and rolling coefficients that the contact has."""
-    if condim == 1:
-        return "none"
-    sliding = [format_number(x) for x in friction[:2]]
-    cells = sliding[:1] if sliding[0] == sliding[1] else sliding
-    cells += [format_number(x) for x in friction[2:3]] if condim >= 4 else []
-    if condim == 6:
-        rolling = [format_number(x) for x in friction[3:]]
-        cells += rolling[:1] if rolling[0] == rolling[1] else rolling
-    return " ".join(cells)
+    kinds = {1: [], 3: [friction[:2]], 4: [friction[:2], friction[2:3]], 6: [friction[:2], friction[2:3], friction[3:]]}
+    cells = [x for kind in kinds[condim] for x in dict.fromkeys(map(format_number, kind))]  # equal ones once
+    return " ".join(cells) or "none"
 
 
 def _range(pair: np.ndarray) -> str:

@@ -87,11 +87,11 @@ class RowLayout:
 
 
 class Noise(eqx.Module):
-    """The effect of noise on the distance r on x of the rows of contacts and limits; a cone uses its first row.
+    """The effect of noise on the distance r on x of the rows of contacts; a cone uses its first row.
 
     Attributes:
         spread: change of x when r changes by one length of the kernel (m/s² or rad/s²); positive.
-        gate: x at which contact ends by distance and not by acceleration; -inf if it never does (m/s² or rad/s²).
+        gate: x at which contact ends by distance and not by acceleration (m/s² or rad/s²).
     """
 
     spread: _PerRow

@@ -182,29 +182,18 @@ def _pyramid_square(
     row_hessian: Float[Array, "num tangents 2 *batch"], friction: Float[Array, "num tangents *batch"], entries: _Entries
 ) -> _Square:
     """Return Jᵀ s'' J of pyramids from their directions; J has the edges n ± μ t as rows."""
-    both, difference = _both_edges(row_hessian, friction)
+    # The sum of s'' at the two edges of each tangent, and μ times the difference.
+    both = row_hessian[:, :, 0] + row_hessian[:, :, 1]
+    difference = friction * (row_hessian[:, :, 0] - row_hessian[:, :, 1])
     difference, (normal, tangents) = difference[:, :, None], (entries[:, 0], entries[:, 1:])
     of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
     of_tangents = difference * normal[:, None] + (friction**2 * both)[:, :, None] * tangents
     return linear.gram(normal, of_normal) + _gram(tangents, of_tangents)
 
 
-def _both_edges(row_hessian: Float[Array, "num tangents 2 *batch"], friction: Float[Array, "num tangents *batch"]):
-    """Return the sum of s'' at the two edges of each tangent, and μ times the difference."""
-    return row_hessian[:, :, 0] + row_hessian[:, :, 1], friction * (row_hessian[:, :, 0] - row_hessian[:, :, 1])
-
-
 def _cone_product(layout: RowLayout, row_hessian: RowHessian, rows: slice, entries: _Entries) -> _Entries:
     """Return s'' of neighbouring elliptic contacts times their rows."""
-    matrix = _cone_matrices(layout, row_hessian, rows, len(entries))
-    return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(entries.shape[1]))
-
-
-def _cone_matrices(
-    layout: RowLayout, row_hessian: RowHessian, rows: slice, num: int
-) -> Float[Array, "num dim dim *batch"]:
-    """Return s'' of neighbouring elliptic contacts."""
     which = next(k for k, cone in enumerate(layout.cones) if cone.start <= rows.start < cone.stop)
-    cone = layout.cones[which]
-    first = (rows.start - cone.start) // cone.dim
-    return row_hessian.cones[which][first : first + num]
+    first = (rows.start - layout.cones[which].start) // layout.cones[which].dim
+    matrix = row_hessian.cones[which][first : first + len(entries)]
+    return linear.add(matrix[:, :, k, None] * entries[:, None, k] for k in range(entries.shape[1]))

@@ -22,15 +22,17 @@ _Ends = Float[Array, "constraints 2 3"]
 
 def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     """Return one block per type of equality constraint in the model."""
-    kinds = mujoco.mjtEq
-    table = (
-        (kinds.mjEQ_CONNECT, _connect),
-        (kinds.mjEQ_WELD, _weld),
-        (kinds.mjEQ_JOINT, _joint),
-        (kinds.mjEQ_TENDON, _tendon),
-    )
-    chosen = [(np.nonzero(model.eq_type == kind)[0], rows) for kind, rows in table]
-    return [rows(model, data, ids) for ids, rows in chosen if ids.size]
+    kinds, found = mujoco.mjtEq, []
+    of_kinds = {
+        kinds.mjEQ_CONNECT: _connect,
+        kinds.mjEQ_WELD: _weld,
+        kinds.mjEQ_JOINT: _joint,
+        kinds.mjEQ_TENDON: _tendon,
+    }
+    for kind, rows in of_kinds.items():
+        if (ids := np.nonzero(model.eq_type == kind)[0]).size:
+            found.append(rows(model, data, ids))
+    return found
 
 
 def _block(

@@ -1,12 +1,12 @@
-r"""Contacts and limits averaged over noise on their distance, in closed form, within the solver.
+r"""Contacts averaged over noise on their distance, in closed form, within the solver.
 
 Noise $w$ on the distance $r$ of a contact shifts its rows' reference acceleration, $a_\text{ref} = -B v - K d\,(r + w)$, and
 decides whether there is contact at all, $r + w < 0$. The mean of each row's cost over the noise is again convex and has a closed
 form, so the same solve finds the acceleration. The average is thus over the step's contact law, not over the motion.
 
-As the length goes to zero the step tends to MuJoCo's own, gate included. The gate matters. A row without it
-(`gated=False`) acts wherever $J a - a_\text{ref} + K d w < 0$, touching or not, as in interior-point and barrier methods.
-Its damping brakes approaching bodies from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact.
+As the length goes to zero the step tends to MuJoCo's own, gate included. A row without the gate
+would act wherever $J a - a_\text{ref} + K d w < 0$, touching or not, as in interior-point and barrier methods. Its damping
+would brake approaching bodies from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact.
 
 A row has x = J a + B J v + c r with c = K d(r), and the force -D x where x < 0 and r < 0. Noise w on r turns these into
 x + c w and r + w. With ρ the noise's density and S its softened ramp, in units of its length (see `kernels`), the mean
@@ -36,7 +36,6 @@ from typing import Literal, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -69,28 +68,21 @@ class Smoothing(eqx.Module):
             off as 1/r.
         mode: "forward" simulates the smoothed contact, with force at a distance and its derivatives. "backward" simulates
             without smoothing, and takes the derivative of the smoothed step at each visited state.
-        limit_length: length for the limits of joints and tendons, in their own units (m or rad); None leaves them unchanged.
-            It is separate, since no single length fits metres and radians.
-        gated: whether noise also decides whether there is contact, as in MuJoCo; if not, rows act at any distance.
     """
 
     length: Float[Array, "..."] = eqx.field(converter=as_float)
     # Plain strings, so that unknown names reach the check below, which lists the choices.
     kernel: str = eqx.field(static=True, default="gaussian")
     mode: str = eqx.field(static=True, default="forward")
-    limit_length: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None, kw_only=True)
-    gated: bool = eqx.field(static=True, default=True, kw_only=True)
 
     def __check_init__(self):
-        """Refuse unknown names, and known lengths that are not positive and finite."""
+        """Refuse unknown names, and a known length that is not positive and finite."""
         for name, choices in (("kernel", tuple(KERNELS)), ("mode", get_args(Mode))):
             if (given := getattr(self, name)) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
-        without = "for MuJoCo's own motion take mg.Discrete()"
-        for name, remedy in (("length", without), ("limit_length", "None leaves limits alone")):
-            value = getattr(self, name)
-            if is_known(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
-                raise ValueError(f"{name} must be positive and finite, got {np.asarray(value)!s}: {remedy}")
+        if is_known(self.length) and not np.all((np.asarray(self.length) > 0) & np.isfinite(self.length)):
+            remedy = "for MuJoCo's own motion take mg.Discrete()"
+            raise ValueError(f"length must be positive and finite, got {np.asarray(self.length)!s}: {remedy}")
 
     @property
     def noise(self) -> Kernel:
@@ -99,15 +91,7 @@ class Smoothing(eqx.Module):
 
 
 def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
-    """Return warnings about parts of a smoothing that have no effect on a model.
-
-    Args:
-        smoothing: the smoothing of a step or rollout.
-        model: a model of MJX; only its static structure is read.
-
-    Returns:
-        One sentence for each part that is not smoothed.
-    """
+    """Return one sentence for each part of a model that is not smoothed; only its static structure is read."""
     messages = []
     pairs = contact_pairs(model)
     if not pairs:
@@ -120,10 +104,6 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
             f"smoothing gives no force at a distance to {shown}: MJX knows the distance of a box, mesh or height field from "
             "anything but a plane only where they overlap; build them of spheres and capsules"
         )
-    is_off = int(model.opt.disableflags) & (mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    has_limits = not is_off and (np.any(model.jnt_limited) or np.any(model.tendon_limited))
-    if smoothing.limit_length is not None and not has_limits:
-        messages.append("limit_length has no effect: no joint or tendon of the scene has a limit")
     return messages
 
 
@@ -134,18 +114,19 @@ def smoothed(
 
     For rows without noise its numbers are not used. If no row is smoothed, noise is None and the rest is unchanged.
     """
-    has_distance, num_contacts, start = _has_distance(model, data), 0, 0
+    contact, num_contacts, start = data._impl.contact, 0, 0
+    has_distance = jnp.ones(len(contact.dist), bool)
+    if np.isin(model.geom_type, CONVEX).any() and len(contact.dist):
+        # A ball on a box has a known distance, but beyond a metre it does not matter.
+        has_distance = ~(jnp.any(are(model, contact.geom, CONVEX), axis=1) & (contact.dist >= 1))
     rows, noises, first = [], [], None
     for block in blocks:
-        each, count = block.rows_each, len(block.residual)
-        length = smoothing.length if block.is_contact else smoothing.limit_length
-        if not each or length is None:
+        count = len(block.residual)
+        if not block.rows_each or not block.is_contact:
             noise = Noise(jnp.ones_like(block.residual), jnp.zeros_like(block.residual))
         else:
-            known = jnp.ones(count // each, bool)
-            if block.is_contact:
-                known = has_distance[num_contacts : num_contacts + count // each]
-                num_contacts += count // each
+            known = has_distance[num_contacts : num_contacts + count // block.rows_each]
+            num_contacts += count // block.rows_each
             block, noise = noisy(model, block, known, smoothing)
             first = start if first is None else first
         rows.append(block)
@@ -158,27 +139,15 @@ def smoothed(
 
 
 def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothing: Smoothing) -> tuple[Block, Noise]:
-    """Return a block that is active at any known distance, and its noise."""
-    each, kernel = block.rows_each, smoothing.noise
-    length = smoothing.length if block.is_contact else smoothing.limit_length
-    assert length is not None
-    length = length.astype(block.residual.dtype)
+    """Return a block of contacts that is active at any known distance, and its noise."""
+    each, kernel, length = block.rows_each, smoothing.noise, smoothing.length.astype(block.residual.dtype)
     distance = jnp.where(known, block.residual[::each], 1.0)
-    # Impedance at the mean of -(r + w) given that it is positive (m or rad).
+    # Impedance at the mean of -(r + w) given that it is positive (m).
     resistance = impedance(block.solimp[::each], length * kernel.depth(distance / length))
     spread = functools.partial(per_row, each=each)
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
-    gate = rate * distance if smoothing.gated else jnp.full_like(distance, -jnp.inf)
     is_present, impedances = spread(known), jax.tree.map(spread, resistance)
     weight = jnp.where(is_present, block.inverse_weight, _WEIGHTLESS)
     present = dataclasses.replace(block, impedance=impedances, inverse_weight=weight, is_active=is_present)
-    return present, Noise(spread(rate * length), spread(gate))
-
-
-def _has_distance(model: mjx.Model, data: mjx.Data) -> Bool[Array, " contacts"]:
-    contact = data._impl.contact
-    if not np.isin(model.geom_type, CONVEX).any() or not len(contact.dist):
-        return jnp.ones(len(contact.dist), bool)
-    # A ball on a box has a known distance, but beyond a metre it does not matter.
-    return ~(jnp.any(are(model, contact.geom, CONVEX), axis=1) & (contact.dist >= 1))
+    return present, Noise(spread(rate * length), spread(rate * distance))

@@ -1,14 +1,16 @@
-"""A scene controlled by actions under noise, with the start of its optimisation; and the paths of the tasks' scenes."""
+"""A scene controlled by actions under noise, with the start of its optimisation; and the scenes of tasks and robots."""
 
 from pathlib import Path
 
 import equinox as eqx
+import mujoco
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ActionNoise, closed_loop, open_loop
 from mjxgrad.objective.task import Policy, SceneTask
+from mjxgrad.scene import Scene, load_scene
 
 # Beside the package in a checkout, inside it when installed from a wheel.
 _FOLDERS = (Path(__file__).parents[2] / "mjcf", Path(__file__).parents[1] / "mjcf")
@@ -59,3 +61,25 @@ def scene_path(name: str) -> Path:
             return path
     looked = " nor ".join(str(folder) for folder in _FOLDERS)
     raise FileNotFoundError(f"no scene {name}.xml in {looked}: run from a checkout, or install the wheel again")
+
+
+def robot_scene(name: str, *, timestep: float | None = None, max_contacts: int | None = None) -> Scene:
+    """Load one of gymnasium's robots, to be stepped by Euler's method.
+
+    Args:
+        name: name of the file without its ending.
+        timestep: time step in s, in place of the file's.
+        max_contacts: see `load_scene`.
+
+    Raises:
+        ImportError: if gymnasium is not installed.
+    """
+    # Imported here: only these robots need it.
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise ImportError(f"{name} is gymnasium's, not installed: pip install 'mjxgrad[envs]'") from error
+    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{name}.xml"
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    return load_scene(model, timestep=timestep, max_contacts=max_contacts)

@@ -63,15 +63,11 @@ def ball_wall() -> BallWall:
     return BallWall(load_scene(scene_path("ball_wall")), jnp.asarray(2.0), jnp.asarray(0.38), horizon=210)
 
 
-def wall_softness(stiffness: float | Float[Array, "..."], damping_ratio: float | Float[Array, "..."] = 1.0) -> Softness:
-    """Return a softness for the wall alone.
+def wall_softness(stiffness: float | Float[Array, "..."]) -> Softness:
+    """Return a softness for the wall alone, critically damped; a stack of them if the stiffness has an axis.
 
     Args:
         stiffness: stiffness in 1/s²: 10 is a curtain, 1e5 a brick. At the default time step the wall is stable up to 1.7e5.
-        damping_ratio: damping ratio; 1 is critical.
-
-    Returns:
-        The softness, or a stack of them if an argument has an axis.
     """
-    stiffness, damping_ratio = jnp.broadcast_arrays(jnp.asarray(stiffness, float), jnp.asarray(damping_ratio, float))
-    return Softness(stiffness, damping_ratio, pairs=WALL_CONTACT)
+    stiffness = jnp.asarray(stiffness, float)
+    return Softness(stiffness, jnp.ones_like(stiffness), pairs=WALL_CONTACT)

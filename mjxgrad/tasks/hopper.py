@@ -5,16 +5,13 @@ first touch, so the derivative is wrong for every parameter that shifts the time
 """
 
 import dataclasses
-from pathlib import Path
 
 import jax.numpy as jnp
-import mujoco
 from jaxtyping import Array, Float
 
 from mjxgrad.objective.policy import linear_policy
 from mjxgrad.rollouts import State, Trajectory, initial_state
-from mjxgrad.scene import load_scene
-from mjxgrad.tasks.action_task import ActionTask
+from mjxgrad.tasks.action_task import ActionTask, robot_scene
 
 # Bent legs absorb the landing; with the downward speed the foot lands after 70 ms.
 START_POSE = (0.0, 1.22, 0.0, -0.4, -0.5, 0.3)  # m, m, rad
@@ -34,16 +31,7 @@ def hopper(*, horizon: int = 150) -> ActionTask:
     Model and contact are gymnasium's; steps are Euler's, at a quarter of the cost of RK4. The policy observes angles and
     speeds of the three joints. At first it holds the posture like springs and dampers. A step is 2 ms.
     """
-    # Imported here: only this task needs it.
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise RuntimeError("the hopper is gymnasium's: pip install 'mjxgrad[experiments]'") from error
-
-    path = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
-    model = mujoco.MjModel.from_xml_path(str(path))
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    scene = load_scene(model)
+    scene = robot_scene("hopper")
     policy, zero = linear_policy(6, 3, observe=joints)
     stiffness, damping = jnp.array(STIFFNESS), jnp.array(DAMPING)
     gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)

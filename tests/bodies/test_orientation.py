@@ -41,18 +41,8 @@ PLANAR = """
 </mujoco>
 """
 FIELDS = (
-    "xpos",
-    "xquat",
-    "xmat",
-    "xipos",
-    "ximat",
-    "xanchor",
-    "xaxis",
-    "geom_xpos",
-    "geom_xmat",
-    "site_xpos",
-    "site_xmat",
-)
+    "xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat",
+)  # fmt: skip
 # Under jax.jit numbers of an argument are not known, and turns are multiplied.
 by_products = jax.jit(kinematics.kinematics)
 

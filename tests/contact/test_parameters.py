@@ -54,7 +54,7 @@ def touching(scene):
 
 
 @pytest.mark.parametrize("name", GEOMS)
-def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, name):
+def test_parameters_are_those_that_c_mujoco_gives_its_contacts_and_their_rows(scene, touching, name):
     geom = scene.mj_model.geom(name).id
     contact = next(c for c in touching.contact if geom in c.geom)
     row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
@@ -64,14 +64,6 @@ def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, 
     np.testing.assert_allclose(ours.solimp[row], contact.solimp, rtol=1e-12)
     np.testing.assert_allclose(ours.friction[row], contact.friction, rtol=1e-12)
     np.testing.assert_allclose(ours.margin[row], contact.includemargin, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", GEOMS)
-def test_stiffness_and_damping_are_those_of_the_rows_of_c_mujoco(scene, touching, name):
-    geom = scene.mj_model.geom(name).id
-    contact = next(c for c in touching.contact if geom in c.geom)
-    row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
-    ours = jax.tree.map(np.asarray, scene.contact_parameters())
     stiffness, damping, _, _ = touching.efc_KBIP[contact.efc_address]
     width = ours.impedance[row, 1]
     # K = k / dw² and B = b / dw.

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mjxgrad.envs import load
-from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
+from tests.envs.test_environment import RAIL, Cart, heavier
 
 _HOW = "pip install brax"
 training = pytest.importorskip("brax.envs.wrappers.training", reason=_HOW)
@@ -18,20 +18,7 @@ ppo = pytest.importorskip("brax.training.agents.ppo.train", reason=_HOW)
 BraxEnv = pytest.importorskip("mjxgrad.envs.brax", reason=_HOW, exc_type=ImportError).BraxEnv
 
 pytestmark = pytest.mark.slow
-RAIL = 1.5  # m
 ACTIONS = jnp.array([[0.6], [-0.4]])
-
-
-class Cart(CartPole):
-    """The swing-up with an end of the rail."""
-
-    def is_over(self, state):
-        return jnp.abs(state.qpos[0]) > RAIL
-
-
-def heavier(key, scene):
-    """Carts and poles of one to two times the mass."""
-    return scene.with_model(body_mass=scene.model.body_mass * jax.random.uniform(key, (), minval=1, maxval=2))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +53,7 @@ def test_steps_are_those_of_the_environment(cart):
     expected = jax.jit(lambda state, action: own.step(state, action))(state.pipeline_state, ACTIONS[0])
     np.testing.assert_allclose(stepped.obs, expected.obs, rtol=1e-12)
     np.testing.assert_allclose(stepped.reward, expected.reward, rtol=1e-12)
-    assert set(stepped.metrics) == set(state.metrics) == {"pole", "cart", "diverged"}
+    assert set(stepped.metrics) == set(state.metrics) == {"pole", "cart", "push", "diverged"}
     assert (env.observation_size, env.action_size) == (5, 1)
 
 

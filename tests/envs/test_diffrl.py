@@ -74,9 +74,10 @@ def test_the_ant_is_paid_for_speed_posture_and_height(ant):
     assert terms == pytest.approx(expected, rel=1e-13)
 
 
-@pytest.mark.parametrize(("height", "is_over"), [(0.26, True), (0.28, False), (3.0, False)])
-def test_the_ant_is_over_below_27_cm(ant, height, is_over):
-    assert bool(ant.is_over(floating(ant, height)[0])) == is_over
+def test_the_ant_is_over_below_27_cm_and_the_hopper_45_cm_lower(ant, hopper):
+    assert [bool(ant.is_over(floating(ant, height)[0])) for height in (0.26, 0.28, 3.0)] == [True, False, False]
+    poses = (hopper.scene.data.qpos.at[1].add(-lowered) for lowered in (0.44, 0.46))
+    assert [bool(hopper.is_over(initial_state(hopper.scene, qpos))) for qpos in poses] == [False, True]
 
 
 @pytest.mark.parametrize(
@@ -113,12 +114,6 @@ def test_the_hopper_is_paid_for_speed_height_and_an_upright_torso(hopper, lowere
     expected = {"forward": 2.0, "height": paid, "upright": 1 - 0.04, "action": -0.1 * 0.75}
     assert rewards(hopper, state, jnp.full(3, 0.5)) == pytest.approx(expected, rel=1e-12)
     np.testing.assert_array_equal(hopper.observe(state, None), np.concatenate([qpos[1:], state.qvel]))
-
-
-@pytest.mark.parametrize(("lowered", "is_over"), [(0.44, False), (0.46, True)])
-def test_the_hopper_is_over_45_cm_lower(hopper, lowered, is_over):
-    qpos = hopper.scene.data.qpos.at[1].add(-lowered)
-    assert bool(hopper.is_over(initial_state(hopper.scene, qpos))) == is_over
 
 
 def test_the_cheetah_is_paid_for_speed_alone_and_never_over():

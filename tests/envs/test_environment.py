@@ -135,8 +135,8 @@ def test_a_state_that_diverges_ends_the_episode_and_says_so(state, step):
     assert step(state, ACTIONS[0]).metrics["diverged"] == 0
 
 
-def test_after_an_end_a_fresh_start_follows(cart, state, going_on):
-    (ended, following), _ = going_on(placed(state, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
+def test_after_an_end_a_fresh_start_follows_without_a_trace_in_the_derivative(cart, state, going_on):
+    (ended, following), (slope_of_end, slope_of_next) = going_on(placed(state, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
     assert ended.terminated
     assert ended.physics.qpos[0] > RAIL
     assert following.num_steps == 0
@@ -146,14 +146,19 @@ def test_after_an_end_a_fresh_start_follows(cart, state, going_on):
     assert np.abs(following.physics.qpos[0]) < 0.5
     assert np.abs(following.physics.qvel).max() < 0.5
     np.testing.assert_array_equal(following.obs, cart.observe(following.physics, None))
+    # Nothing after an end depends on an action before it.
+    assert np.abs(slope_of_end).min() > 0
+    np.testing.assert_array_equal(slope_of_next, 0.0)
 
 
-def test_without_an_end_the_episode_goes_on(state, going_on):
-    (ended, following), _ = going_on(state, ACTIONS[0])
+def test_without_an_end_the_episode_goes_on_and_so_does_the_derivative(state, going_on):
+    (ended, following), (slope_of_end, slope_of_next) = going_on(state, ACTIONS[0])
     assert not ended.done
     for now, then in zip(jax.tree.leaves(ended.physics), jax.tree.leaves(following.physics), strict=True):
         np.testing.assert_array_equal(now, then)
     assert following.num_steps == 1
+    np.testing.assert_array_equal(slope_of_next, slope_of_end)
+    assert np.abs(slope_of_next).min() > 0
 
 
 def test_each_next_episode_begins_elsewhere(state, going_on):
@@ -161,18 +166,6 @@ def test_each_next_episode_begins_elsewhere(state, going_on):
     (_, first), _ = going_on(beyond, ACTIONS[0])
     (_, second), _ = going_on(placed(first, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
     assert np.abs(first.physics.qpos - second.physics.qpos).min() > 0
-
-
-def test_nothing_after_an_end_depends_on_an_action_before_it(state, going_on):
-    _, (slope_of_end, slope_of_next) = going_on(placed(state, qpos=[RAIL + 0.1, 3.0]), ACTIONS[0])
-    assert np.abs(slope_of_end).min() > 0
-    np.testing.assert_array_equal(slope_of_next, 0.0)
-
-
-def test_within_an_episode_the_derivative_goes_on(state, going_on):
-    _, (slope_of_end, slope_of_next) = going_on(state, ACTIONS[0])
-    np.testing.assert_array_equal(slope_of_next, slope_of_end)
-    assert np.abs(slope_of_next).min() > 0
 
 
 def test_random_copies_under_vmap_are_those_one_by_one(cart, state):

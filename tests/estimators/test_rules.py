@@ -36,12 +36,24 @@ def assert_decides(rule, facts: Evidence, alpha: float, reason, bias_bound: floa
     assert Reason[weights.reason] == Reason[reason]
 
 
-def test_inverse_variance_weighs_by_variances_alone():
-    assert_decides(rules.InverseVariance(), evidence(difference_norm=1e9), 0.8, Reason.inverse_variance, np.nan)
-
-
-def test_two_parts_without_variance_are_first_order():
-    assert rules.InverseVariance()(evidence(first_variance=0.0, zeroth_variance=0.0)).alpha == 1
+@pytest.mark.parametrize(
+    ("rule", "changes", "alpha", "reason", "bound"),
+    [
+        (rules.FixedAlpha(0.3), {}, 0.3, Reason.fixed, np.nan),
+        (rules.InverseVariance(), {"difference_norm": 1e9}, 0.8, Reason.inverse_variance, np.nan),
+        (
+            rules.InverseVariance(),
+            {"first_variance": 0.0, "zeroth_variance": 0.0},
+            1.0,
+            Reason.inverse_variance,
+            np.nan,
+        ),
+        (rules.Consistent(), {}, 0.8, Reason.inverse_variance, 0.8 * 0.05 * 2.0),
+        (rules.Consistent(threshold=0.1), {"inconsistency": 0.11}, 0.0, Reason.inconsistent, 0.0),
+    ],
+)
+def test_a_rule_weighs_by_what_it_looks_at_alone(rule, changes, alpha, reason, bound):
+    assert_decides(rule, evidence(**changes), alpha, reason, bound)
 
 
 # sqrt(2 V ln((d+1)/δ) / N) + 2 L ln((d+1)/δ) / (3 N) with V = 4, d = 3, δ = 0.05, N = 50, L = 6
@@ -70,10 +82,6 @@ def test_the_concavity_test_is_the_published_inequality():
     assert Reason[weights.reason] == Reason[Reason.inconsistent]
 
 
-def test_consistent_derivatives_are_weighed_by_their_variance_until_a_bias_shows():
-    assert_decides(rules.Consistent(), evidence(), 0.8, Reason.inverse_variance, 0.8 * 0.05 * 2.0)
-
-
 def test_a_difference_beyond_its_own_noise_counts_as_error_of_the_first_order():
     """Quantile 2.00958: the noise of the difference is 2.00958 sqrt(5/50); V⁰/(V⁰ + V¹ + n excess)."""
     excess = 1.5**2 - 2.0095752**2 * 5 / 50
@@ -81,14 +89,6 @@ def test_a_difference_beyond_its_own_noise_counts_as_error_of_the_first_order():
     weights = rules.Consistent()(evidence(difference_norm=1.5))
     np.testing.assert_allclose(weights.alpha, alpha, rtol=1e-6)
     assert Reason[weights.reason] == Reason[Reason.bias_limit]
-
-
-def test_derivatives_that_contradict_the_costs_are_not_used():
-    assert_decides(rules.Consistent(threshold=0.1), evidence(inconsistency=0.11), 0.0, Reason.inconsistent, 0.0)
-
-
-def test_a_given_alpha_is_taken():
-    assert_decides(rules.FixedAlpha(0.3), evidence(), 0.3, Reason.fixed, np.nan)
 
 
 @pytest.mark.parametrize("dim", [1, 5])

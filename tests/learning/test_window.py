@@ -31,19 +31,17 @@ def first_number(obs):
     return obs[0]
 
 
-def test_a_window_returns_discounted_rewards_and_the_value_of_where_it_ends():
-    """1 + 0.9·2 + 0.81·3 + 0.729·30."""
-    assert_allclose(returned(window_of([1, 2, 3]), first_number, 0.9), 1 + 1.8 + 2.43 + 0.729 * 30)
-
-
-def test_an_end_for_good_has_no_value_and_what_follows_counts_anew():
-    """(1) then (2 + 0.9·3 + 0.81·30)."""
-    assert_allclose(returned(window_of([1, 2, 3], terminated=[0]), first_number, 0.9), 1 + 2 + 2.7 + 0.81 * 30)
-
-
-def test_an_end_of_time_has_the_value_of_its_last_observation():
-    """(1 + 0.9·10) then (2 + 0.9·3 + 0.81·30)."""
-    assert_allclose(returned(window_of([1, 2, 3], truncated=[0]), first_number, 0.9), 1 + 9 + 2 + 2.7 + 0.81 * 30)
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [
+        ({}, 1 + 0.9 * 2 + 0.81 * 3 + 0.729 * 30),
+        ({"terminated": [0]}, 1 + (2 + 0.9 * 3 + 0.81 * 30)),
+        ({"truncated": [0]}, (1 + 0.9 * 10) + (2 + 0.9 * 3 + 0.81 * 30)),
+    ],
+)
+def test_a_window_returns_discounted_rewards_and_the_value_of_where_it_ends(ends, expected):
+    """An end for good has no value, an end of time that of its last observation; what follows counts anew."""
+    assert_allclose(returned(window_of([1, 2, 3], **ends), first_number, 0.9), expected)
 
 
 def test_targets_mix_sums_of_all_lengths():
@@ -158,14 +156,10 @@ def random_gradients(*, bad=()):
     return Gradients(jnp.asarray(first), jnp.asarray(zeroth), jnp.asarray(is_finite))
 
 
-def test_fixed_weights_give_either_gradient():
+def test_fixed_weights_give_either_gradient_and_inverse_variance_is_by_step():
     both = random_gradients()
     assert_allclose(mix(both, FixedAlpha(1.0))[0], both.first)
     assert_allclose(mix(both, FixedAlpha(0.0))[0], both.zeroth)
-
-
-def test_inverse_variance_is_by_step():
-    both = random_gradients()
     _, weights, _ = mix(both, InverseVariance())
     first, zeroth = (np.var(x, axis=0, ddof=1) for x in (both.first, both.zeroth))
     assert_allclose(weights.alpha, zeroth / (zeroth + first))

@@ -13,20 +13,17 @@ from tests.loop.problems import CENTRE, CURVATURE, made_up
 START = jnp.array([0.0, 0.5])
 
 
-def loop(transformation, num_steps, **extra):
+def loop(transformation, num_steps):
     def step(carry, _):
         params, state = carry
-        change, state = transformation.update(None, state, params, **extra)
+        change, state = transformation.update(None, state, params)
         return (optax.apply_updates(params, change), state), params
 
     return jax.jit(lambda p: jax.lax.scan(step, (p, transformation.init(p)), length=num_steps)[0])(START)
 
 
 def test_the_trajectory_is_that_of_optimise(key):
-    settings = {
-        "optimiser": optax.adam(0.05),
-        "annealing": optax.exponential_decay(1.0, 10, 0.5),
-    }
+    settings = {"optimiser": optax.adam(0.05), "annealing": optax.exponential_decay(1.0, 10, 0.5)}
 
     def smoothed(scale):
         return problems.objective.with_stddev(0.1 * scale)
@@ -48,15 +45,6 @@ def test_without_an_optimiser_it_is_the_gradient_for_a_chain(key):
     np.testing.assert_allclose(params, CENTRE + (START - CENTRE) * (1 - 0.1 * CURVATURE) ** 30, rtol=1e-12)
 
 
-def test_another_objective_and_key_can_be_given_for_an_update(key):
-    other_key, shifted = jax.random.key(1), mg.parameter_noise(lambda x: problems.bowl(x - 1), 0.3, dim=2)
-    transformation = mg.estimated_gradient(problems.objective, key, estimator=problems.first_order)
-    state = transformation.init(START)
-    change, _ = transformation.update(None, state, START, key=other_key, objective=shifted)
-    expected = problems.first_order(shifted, START, jax.random.fold_in(other_key, 0)).value
-    np.testing.assert_allclose(change, expected, rtol=1e-12)
-
-
 def test_the_gradient_of_anything_else_is_added(key):
     transformation = mg.estimated_gradient(problems.objective, key, estimator=problems.exact)
     change, _ = transformation.update(jnp.array([0.25, 0.5]), transformation.init(START), START)
@@ -69,9 +57,5 @@ def test_an_estimate_that_is_not_finite_is_a_zero_update_and_counted(key):
     np.testing.assert_array_equal(change, 0)
     assert state.num_skipped == 1
     assert np.isnan(state.estimate.value[0])
-
-
-def test_what_cannot_be_is_refused(key):
-    transformation = mg.estimated_gradient(problems.objective, key, estimator=problems.exact)
     with pytest.raises(ValueError, match="params must be given to update"):
         transformation.update(None, transformation.init(START))

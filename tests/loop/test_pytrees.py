@@ -97,11 +97,6 @@ def test_a_run_is_resumed(key, form, tmp_path):
     np.testing.assert_array_equal(back(resumed.params), back(whole.params))
 
 
-def test_parameters_without_a_number_to_move_are_refused(key):
-    with pytest.raises(ValueError, match="params must have floating-point arrays"):
-        mg.optimise(problems.objective, {"a": 1}, key, num_steps=1, **SETTINGS)
-
-
 def test_a_policy_comes_back_in_its_own_form(key):
     """The objective has a way of its own from the vector to the policy's parameters; both agree."""
     policy = {"gain": jnp.array([[0.3, -0.2]]), "offset": jnp.array([0.1])}

@@ -52,14 +52,9 @@ def dead_zone(x):
 
 @pytest.mark.parametrize("name", ["first_order", "zeroth_order", "alpha_order", "control_variate"])
 def test_a_run_that_feels_nothing_stops_at_once_and_says_so(key, name):
-    result = mg.optimise(
-        mg.parameter_noise(dead_zone, 0.1),
-        START,
-        key,
-        estimator=functools.partial(getattr(mg.estimators, name), num_samples=8),
-        optimiser=optax.adam(0.1),
-        num_steps=60,
-    )
+    estimator = functools.partial(getattr(mg.estimators, name), num_samples=8)
+    settings = {"estimator": estimator, "optimiser": optax.adam(0.1), "num_steps": 60}
+    result = mg.optimise(mg.parameter_noise(dead_zone, 0.1), START, key, **settings)
     assert result.stopped == mg.Stopped.nothing_felt
     assert "nothing that the parameters change reaches the cost" in mg.Stopped[result.stopped]
     assert result.num_steps == 3

@@ -11,10 +11,7 @@ from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import SceneTask
 from tests.estimators import textbook
-
-STDDEV = 0.3
-CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
-POLICY_PARAMS = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+from tests.objective.test_objective import CONTROLS, POLICY_PARAMS, STDDEV
 
 
 @pytest.fixture
@@ -27,18 +24,13 @@ def params(objective):
     return objective.ravel(POLICY_PARAMS)
 
 
-def test_an_antithetic_pair_begins_at_the_same_place(objective, key):
+def test_mirrored_and_redrawn_noise_begins_at_the_same_place(objective, key):
+    """Redrawn, it is what `sample_noise` would draw otherwise: new actions, old start."""
     noise, start = objective.sample_noise(key)
     mirrored, same = objective.mirror((noise, start))
+    other, as_well = objective.redraw((noise, start), jax.random.key(1))
     np.testing.assert_array_equal(mirrored, -noise)
-    np.testing.assert_array_equal(same, start)
-
-
-def test_redrawn_noise_begins_at_the_same_place(objective, key):
-    """It is what `sample_noise` would draw otherwise: new actions, old start."""
-    noise, start = objective.sample_noise(key)
-    other, same = objective.redraw((noise, start), jax.random.key(1))
-    np.testing.assert_array_equal(same, start)
+    np.testing.assert_array_equal([same, as_well], [start, start])
     assert np.abs(other - noise).min() > 0
 
 

@@ -199,18 +199,12 @@ def test_a_cylinder_and_the_one_it_hangs_from_are_no_obstacle():
     assert load_scene(f"<mujoco><worldbody>{body}</worldbody></mujoco>").pairs == ()
 
 
-def test_an_excluded_pair_is_no_obstacle():
-    source = REFUSED["cylinder with box"][0].replace("name='wall'", "name='wall' conaffinity='0'")
-    source = source.replace("name='wall'", "name='wall' contype='0'")
-    assert load_scene(source).mj_model.ngeom == 4
-
-
-def test_with_contact_disabled_no_pair_is_an_obstacle():
-    source = REFUSED["cylinder with box"][0].replace("></option>", "><flag contact='disable'/></option>")
-    assert load_scene(source).pairs == ()
-
-
-def test_unused_settings_are_no_obstacle():
+def test_excluded_pairs_and_unused_settings_are_no_obstacle():
+    source = REFUSED["cylinder with box"][0]
+    excluded = source.replace("name='wall'", "name='wall' contype='0' conaffinity='0'")
+    assert load_scene(excluded).mj_model.ngeom == 4
+    disabled = source.replace("></option>", "><flag contact='disable'/></option>")
+    assert load_scene(disabled).pairs == ()
     # An ellipsoid fluid shape without fluid, a group without actuators.
     load_scene(_fill(PENDULUM, geom="fluidshape='ellipsoid'"))
     load_scene(_fill(PENDULUM, option="actuatorgroupdisable='2'", rest=_actuator("group='1'")))

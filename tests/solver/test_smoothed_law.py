@@ -35,17 +35,15 @@ def _nodes(kinks, distribution, num_nodes=40):
 
 
 @kernels
-@pytest.mark.parametrize("is_gated", [True, False])
-def test_force_of_a_row_is_the_mean_over_noise(name, is_gated):
+def test_force_of_a_row_is_the_mean_over_noise(name):
     """-D E[(x + c w) 1(x + c w < 0)], gated by r + w < 0, to 1e-8 of the largest; above, below and at the gate."""
     distance = np.array([-6e-3, -1e-3, 0.0, 1.5e-3, 4e-3, -2e-3, 2e-3])
     x = RATE * distance + np.array([1.0, -3.0, -2.0, 2.0, -9.0, 0.0, -2.5])
     weight = np.linspace(1.0, 3.0, len(x))
-    gate = RATE * distance if is_gated else np.full(len(x), -np.inf)
     layout = RowLayout(0, 0, len(x), (), KERNELS[name])
-    noise = Noise(jnp.full(len(x), RATE * LENGTH), jnp.asarray(gate))
+    noise = Noise(jnp.full(len(x), RATE * LENGTH), jnp.asarray(RATE * distance))
     rows = Rows(jnp.zeros(len(x)), jnp.asarray(weight), jnp.zeros(len(x)), (), noise)
-    last = np.minimum(-x / RATE, -distance if is_gated else np.inf)[:, None]
+    last = np.minimum(-x / RATE, -distance)[:, None]
     w, share = _nodes(last / LENGTH, DISTRIBUTIONS[name])
     pushes = np.where(LENGTH * w < last, x[:, None] + RATE * LENGTH * w, 0.0)
     exact = -weight * np.sum(share * pushes, axis=1)

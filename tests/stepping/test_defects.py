@@ -40,6 +40,14 @@ def _outcome(step, model, data, nq):
     return outcome
 
 
+def _check_jacobian(step, model, data, close):
+    """Compare the Jacobian of a step by position and velocity with central differences."""
+    outcome = _outcome(step, model, data, model.nq)
+    x = jnp.concatenate([data.qpos, data.qvel])
+    truth = jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(outcome))(x), truth, **close)
+
+
 def _settled(text, steps=1500):
     """Return MJX's model, and data at rest with the warm start of the last step."""
     model = mujoco.MjModel.from_xml_string(text)
@@ -58,24 +66,15 @@ def test_reverse_mode_passes_through_a_solve_of_many_iterations(step):
 
 @both
 def test_jacobian_at_rest_does_not_depend_on_the_warm_start(step):
-    model, data = _settled(BALL.format(option="", geom=""))
-    outcome = _outcome(step, model, data, 1)
-    x = jnp.concatenate([data.qpos, data.qvel])
-    np.testing.assert_allclose(
-        jax.jit(jax.jacfwd(outcome))(x), jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x), **_CLOSE
-    )
+    _check_jacobian(step, *_settled(BALL.format(option="", geom="")), _CLOSE)
 
 
 @both
 @pytest.mark.slow
 def test_elliptic_contact_without_sliding_has_a_jacobian(step):
     text = BALL.format(option='cone="elliptic"', geom='condim="4"')
-    model, data = _settled(text.replace('<joint type="slide" axis="0 0 1" damping=".1"/>', "<freejoint/>"))
-    outcome = _outcome(step, model, data, 7)
-    x = jnp.concatenate([data.qpos, data.qvel])
-    np.testing.assert_allclose(
-        jax.jit(jax.jacfwd(outcome))(x), jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x), **_CLOSE
-    )
+    free = text.replace('<joint type="slide" axis="0 0 1" damping=".1"/>', "<freejoint/>")
+    _check_jacobian(step, *_settled(free), _CLOSE)
 
 
 @both
@@ -133,37 +132,26 @@ def test_a_contact_deeper_than_its_width_can_be_differentiated(step):
 
 
 @both
-def test_a_direct_solref_without_damping_can_be_differentiated(step):
-    model, data = put(BALL.format(option="", geom=""))
-    data = data.replace(qpos=jnp.array([-0.001]))
-
-    @jax.jit
-    def outcome(stiffness):
-        solref = jnp.stack([-stiffness, jnp.zeros_like(stiffness)])
-        moved = step(model.replace(geom_solref=jnp.broadcast_to(solref, model.geom_solref.shape)), data)
-        return moved.qvel[0]
-
-    slope = jax.jit(jax.grad(outcome))(jnp.array(1e4))
-    width = 1.0
-    truth = (outcome(1e4 + width) - outcome(1e4 - width)) / (2 * width)
-    np.testing.assert_allclose(slope, truth, rtol=1e-6)
-
-
-@both
-def test_at_the_clamp_of_refsafe_the_time_constant_counts(step):
-    """At exactly two time steps every larger value acts: the one-sided derivative, not half of it."""
+@pytest.mark.parametrize(
+    ("solref", "at", "low", "high", "close"),
+    [
+        pytest.param((-1, 0), 1e4, 1e4 - 1, 1e4 + 1, 1e-6, id="direct, without damping"),
+        pytest.param((1, 1), 0.004, 0.004, 0.004 + 1e-8, 1e-4, id="at the clamp of refsafe"),
+    ],
+)
+def test_stiffness_and_time_constant_have_their_derivative(step, solref, at, low, high, close):
+    """At exactly two time steps every larger time constant acts: the one-sided derivative, not half of it."""
     model, data = put(BALL.format(option='timestep=".002"', geom=""))
     data = data.replace(qpos=jnp.array([-0.001]))
 
     @jax.jit
-    def outcome(time_constant):
-        solref = jnp.stack([time_constant, jnp.ones_like(time_constant)])
-        return step(model.replace(geom_solref=jnp.broadcast_to(solref, model.geom_solref.shape)), data).qvel[0]
+    def outcome(x):
+        numbers = jnp.stack([solref[0] * x, jnp.full_like(x, solref[1])])
+        return step(model.replace(geom_solref=jnp.broadcast_to(numbers, model.geom_solref.shape)), data).qvel[0]
 
-    slope = jax.jit(jax.grad(outcome))(2 * model.opt.timestep)
-    width = 1e-8
-    truth = (outcome(0.004 + width) - outcome(jnp.array(0.004))) / width
-    np.testing.assert_allclose(slope, truth, rtol=1e-4)
+    slope = jax.jit(jax.grad(outcome))(2 * model.opt.timestep if at == 0.004 else jnp.array(at))
+    truth = (outcome(jnp.array(high)) - outcome(jnp.array(low))) / (high - low)
+    np.testing.assert_allclose(slope, truth, rtol=close)
 
 
 CYLINDER = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50"/><worldbody>
@@ -176,22 +164,12 @@ WELD = """<mujoco><option tolerance="1e-13" iterations="100" ls_iterations="50" 
 
 
 @both
-@pytest.mark.parametrize(
-    "text",
-    [
-        pytest.param(CYLINDER, id="standing cylinder", marks=pytest.mark.slow),
-        pytest.param(WELD, id="weld at zero error", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [CYLINDER, WELD], ids=["standing cylinder", "weld at zero error"])
 def test_a_degenerate_pose_keeps_its_derivative(step, text):
     """The cylinder's tilt about its first contact point; a weld with nothing to correct."""
-    model, data = _settled(text)
-    outcome = _outcome(step, model, data, model.nq)
-    x = jnp.concatenate([data.qpos, data.qvel])
-    slope = jax.jit(jax.jacfwd(outcome))(x)
-    truth = jax.jit(lambda x: central_difference(outcome, x, _WIDTH))(x)
     # The cylinder's rim is chosen anew on either side of upright: an error of first order in the width, times stiffness.
-    np.testing.assert_allclose(slope, truth, rtol=1e-4, atol=3e-4)
+    _check_jacobian(step, *_settled(text), {"rtol": 1e-4, "atol": 3e-4})
 
 
 @pytest.mark.slow

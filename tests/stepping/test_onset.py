@@ -105,23 +105,14 @@ def _jumps(name, kind):
 _ROUNDING = 1e-7
 
 
-@pytest.mark.parametrize(
-    "name", ["ball", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ball_elliptic", "hopper"))]
-)
-def test_outcomes_of_neighbouring_starts_and_parameters_are_neighbours(name):
-    assert _jumps(name, "continuous") < _ROUNDING
-    assert _jumps(name, "mujoco") > 1e-5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "walker2d", "ant", "ball_frictionless", "ball_torsion", "ball_rolling", "ball_inclined", "ball_inclined_rolling",
-        "two_balls", "two_balls_elliptic", "arm",
-    ],
+_SLOW = (
+    "ball_elliptic", "hopper", "walker2d", "ant", "ball_frictionless", "ball_torsion", "ball_rolling", "ball_inclined",
+    "ball_inclined_rolling", "two_balls", "two_balls_elliptic", "arm",
 )  # fmt: skip
-def test_no_motion_with_impacts_has_jumps(name):
+
+
+@pytest.mark.parametrize("name", ["ball", *(pytest.param(name, marks=pytest.mark.slow) for name in _SLOW)])
+def test_outcomes_of_neighbouring_starts_and_parameters_are_neighbours(name):
     assert _jumps(name, "continuous") < _ROUNDING
     assert _jumps(name, "mujoco") > 1e-5
 

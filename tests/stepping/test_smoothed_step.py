@@ -97,19 +97,11 @@ def test_without_length_it_is_the_step_of_mujoco(scene):
         np.testing.assert_allclose(found, hard, rtol=1e-4, atol=1e-6)
 
 
-def test_without_the_gate_an_approaching_body_is_braked_from_afar():
-    """At 1 m/s a row without gate acts from 2 ζ |v| / ω = 40 mm (dw B / (d K)) on; with it, from a few lengths."""
-    far = 0.02
-    assert _at(far, -1.0, contact=mg.Smoothing(LENGTH))[0] == pytest.approx(-9.81, abs=1e-9)
-    assert _at(far, -1.0, contact=mg.Smoothing(LENGTH, gated=False))[0] > 5.0
-
-
-def test_limits_are_smoothed_by_a_length_of_their_own():
-    """A slider at rest 1 mm before its limit is pushed back if limits are smoothed, and only then."""
-    contacts, both = mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, limit_length=LENGTH)
-    assert _at(1.0, limit=0.099, contact=contacts)[2] == 0
-    assert _at(1.0, limit=0.099, contact=both)[2] < -0.1
-    assert _at(1.0, limit=0.0, contact=both)[2] == pytest.approx(0, abs=1e-9)
+def test_an_approaching_body_is_not_braked_from_afar_nor_is_a_limit_smoothed():
+    """At 1 m/s a row without gate would act from 2 ζ |v| / ω = 40 mm (dw B / (d K)) on; the slider is 1 mm from its limit."""
+    found = _at(0.02, -1.0, limit=0.099, contact=mg.Smoothing(LENGTH))
+    assert found[0] == pytest.approx(-9.81, abs=1e-9)
+    assert found[2] == 0
 
 
 @scenes
@@ -208,7 +200,7 @@ def test_a_ball_over_a_box_has_force_at_a_distance_and_no_warning():
     assert forward(mjx.make_data(model)).qacc[0] > -9.81 + 1
 
 
-def test_a_scene_without_contact_or_limits_is_named():
+def test_a_scene_without_contact_is_named():
     """By the rollout, too, with the scene's name and the kernel's."""
     scene = mg.load_scene(
         '<mujoco model="void"><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
@@ -217,7 +209,6 @@ def test_a_scene_without_contact_or_limits_is_named():
         jax.eval_shape(
             lambda s: mg.rollout(scene, s, horizon=2, contact=mg.Smoothing(1e-3, "logistic")), mg.initial_state(scene)
         )
-    assert "limit_length has no effect" in smoothing_warnings(mg.Smoothing(1.0, limit_length=0.1), scene.model)[1]
 
 
 @pytest.mark.parametrize(
@@ -226,7 +217,6 @@ def test_a_scene_without_contact_or_limits_is_named():
         ({"length": 0.0}, "length must be positive and finite, got 0.0"),
         ({"length": -1e-3}, "length must be positive"),
         ({"length": [1e-3, np.inf]}, "length must be positive"),
-        ({"length": 1e-3, "limit_length": -1.0}, "limit_length must be positive"),
         (
             {"length": 1e-3, "kernel": "cauchy"},
             "kernel must be one of 'gaussian', 'logistic', 'log_barrier', got 'cauchy'",
