@@ -2,14 +2,12 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import mujoco
@@ -26,18 +24,16 @@ from mjxgrad.checking.findings import (
     left_out_findings,
     measured_findings,
     recommend,
-    slopes,
     static_findings,
     touch_speed,
 )
-from mjxgrad.checking.measure import Measured, measure
+from mjxgrad.checking.measure import Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.checking.moving import Mover, Outcomes
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page
 from mjxgrad.rollouts import Trajectory
 from mjxgrad.scene import Scene, SceneError, load_scene
-from mjxgrad.stepping import Engine
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -99,37 +95,12 @@ class Verdict:
         """Return the detailed report: measurements, scene, time step."""
         spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
         of_what = [] if self.measured is None else [f"Outcomes: {'; '.join(self.outcomes)}."]
-        rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
-        noises = [
-            f"Noise {row['stddev']:g}, {'the file' if row['stiffness'] is None else format_number(row['stiffness'])}: variance "
-            f"{_numbers(row['first_variance'])} of first order, {_numbers(row['zeroth_variance'])} of zeroth; "
-            f"first less zeroth {_numbers(row['bias'])} ± {_numbers(row['bias_error'])}"
-            for row in rows
-        ]
+        noises = [] if self.measured is None else map(_noise_text, self.measured.noises)
         return {
             "What was measured": "\n".join([*of_what, *noises, f"Time: {spent}."]),
             "The scene": self.scene.summary(),
             "Time step and contacts": self.stability.summary(),
         }
-
-    def as_json(self) -> str:
-        """Return the verdict as JSON; numbers in SI units."""
-        measured = self.measured
-        table: dict[str, Any] = {
-            "scene": self.name,
-            "headline": self.headline,
-            "findings": [asdict(finding) for finding in self.findings],
-            "recommendation": asdict(self.recommendation),
-            "code": self.code,
-            "outcomes": self.outcomes,
-            "touches": [asdict(touch) for touch in self.motions.touches],
-            "slopes": [] if measured is None else [asdict(one) for one in slopes(measured)],
-            "noise": [] if measured is None else list(map(_noise_row, measured.noises)),
-            "omissions": [asdict(one) for one in self.scene.omissions],
-            "conversions": [asdict(one) for one in self.scene.conversions],
-            "seconds": self.seconds,
-        }
-        return json.dumps(table, indent=2, ensure_ascii=False, default=str)
 
     def as_html(self) -> str:
         """Return the verdict as a self-contained page; needs `mjxgrad[render]`."""
@@ -146,7 +117,6 @@ def check(
     cost: Cost | None = None,
     *,
     derivatives: bool = True,
-    engine: Engine = "mujoco",
     budget: int | float = 12.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
@@ -162,8 +132,6 @@ def check(
         cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it; motions are then simulated
             from their start. None uses random mixes of final positions and velocities.
         derivatives: whether to measure derivatives; False looks at motions alone.
-        engine: "mujoco" measures by C MuJoCo without compilation; "mjx" measures by the step that a GPU would run, and needs
-            a budget of minutes.
         budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
             measurements that are left out.
         seed: seed of all random numbers.
@@ -194,9 +162,9 @@ def check(
     names, outcomes = _outcomes(scene, cost, rng)
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
-        say(f"measuring derivatives by {'MJX, which compiles first' if engine == 'mjx' else 'C MuJoCo'}")
+        say("measuring derivatives by C MuJoCo")
         measuring = time.perf_counter()
-        mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget, engine)
+        mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget)
         with contextlib.suppress(TimeoutError):
             measured = measure(
                 scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
@@ -272,22 +240,15 @@ def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tupl
     return tuple(words), lambda t: jnp.concatenate([mix @ end for mix, end in zip(mixes, ends(t), strict=True)])
 
 
-def _noise_row(noise) -> dict[str, Any]:
-    bias = np.asarray(noise.first.value - noise.zeroth.value)[-1, :, 0]
-    error = np.hypot(np.asarray(noise.first.standard_error), np.asarray(noise.zeroth.standard_error))[-1, :, 0]
-    return {
-        "stddev": noise.stddev,
-        "stiffness": noise.stiffness,
-        "first_variance": np.asarray(noise.first.variance)[-1].tolist(),
-        "zeroth_variance": np.asarray(noise.zeroth.variance)[-1].tolist(),
-        "bias": bias.tolist(),
-        "bias_error": error.tolist(),
-        "first_is_better_until": noise.crossover.horizon,
-    }
-
-
-def _numbers(values: list[float]) -> str:
-    return ", ".join(f"{value:.2g}" for value in values)
+def _noise_text(noise: Noise) -> str:
+    """Return variances and bias at the last time, one number per outcome."""
+    first, zeroth = noise.first, noise.zeroth
+    error = np.hypot(first.standard_error, zeroth.standard_error)[..., 0]
+    columns = first.variance, zeroth.variance, (first.value - zeroth.value)[..., 0], error
+    of_first, of_zeroth, bias, off = (", ".join(f"{x:.2g}" for x in np.asarray(one)[-1]) for one in columns)
+    where = "the file" if noise.stiffness is None else format_number(noise.stiffness)
+    variances = f"variance {of_first} of first order, {of_zeroth} of zeroth"
+    return f"Noise {noise.stddev:g}, {where}: {variances}; first less zeroth {bias} ± {off}"
 
 
 def _code(scene: Scene, advice: Recommendation, path: str) -> str:

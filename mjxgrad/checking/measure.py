@@ -14,7 +14,6 @@ from mjxgrad._text import format_number
 from mjxgrad.checking.motions import Motions, half_range, pairs_at, smooth
 from mjxgrad.checking.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
 from mjxgrad.contact import Softness
-from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
 from mjxgrad.estimators import GradientEstimate
@@ -84,7 +83,7 @@ class Noise:
     stiffness: float | None
     first: GradientEstimate
     zeroth: GradientEstimate
-    crossover: Crossover
+    crossover: float
 
     @property
     def advantage(self) -> float:
@@ -335,16 +334,34 @@ def _estimates(
     return jax.tree.map(lambda leaf: leaf.reshape(*costs.shape[1:], *leaf.shape[1:]), found)
 
 
-def _crossover(times: np.ndarray, found: Moved, scores: np.ndarray, zeroth: GradientEstimate) -> Crossover:
+def _crossover(times: np.ndarray, found: Moved, scores: np.ndarray, zeroth: GradientEstimate) -> float:
     """Return the time from which single zeroth-order samples are as accurate, with equal weight for all outcomes."""
     is_finite = np.isfinite(found.outcomes).all(axis=(1, 2)) & np.isfinite(found.derivatives).all(axis=(1, 2))
     costs, derivatives, scores = (x[is_finite] for x in (found.outcomes, found.derivatives, scores))
     if len(costs) < 2:
-        return Crossover(float(times[0]), float(times[0]), float(times[0]), np.zeros(len(times)))
+        return float(times[0])
     terms = (costs - costs.mean(axis=0)) * scores * len(costs) / (len(costs) - 1)
     truth = np.asarray(zeroth.value)[..., 0]
     squares = [(one - truth) ** 2 for one in (derivatives, terms)]
     weight = squares[1].mean(axis=0)
     weight = np.where(weight > _UNFELT**2 * weight.max(), weight, np.inf)
-    shares = [(square / weight).sum(axis=2) for square in squares]
-    return crossover(times, *shares, num_resamples=200)
+    return crossing(times, *((square / weight).sum(axis=2).mean(axis=0) for square in squares))
+
+
+def crossing(
+    times: Float[np.ndarray, " times"], first: Float[np.ndarray, " times"], second: Float[np.ndarray, " times"]
+) -> float:
+    """Return the time from which the second of two mean squared errors is at most the first.
+
+    It follows the last time at which the first is smaller, so brief draws before it do not count. The logarithm of their
+    ratio is interpolated. It is infinite without a crossing, and the first time if the second is smaller throughout.
+    """
+    tiny = np.finfo(float).tiny  # two errors of zero are equal
+    log_ratio = np.log(np.maximum(first, tiny)) - np.log(np.maximum(second, tiny))
+    if not (log_ratio < 0).any():
+        return float(times[0])
+    last = int(np.flatnonzero(log_ratio < 0)[-1])
+    if last == len(times) - 1:
+        return np.inf
+    below, above = log_ratio[last], log_ratio[last + 1]
+    return float(times[last] - below / (above - below) * (times[last + 1] - times[last]))

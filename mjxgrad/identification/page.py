@@ -1,26 +1,19 @@
-"""Report of an identification as HTML page and JSON: the answer, signals, values, and the motion before and after."""
+"""Report of an identification as a page: the answer, signals before and after, and values."""
 
-import functools
-import json
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import ArrayLike
 
 from mjxgrad.identification import Identification, Recording, Stopped
 from mjxgrad.identification.recording import simulated, stack
 from mjxgrad.report import INK, Block, Table, page, svg
-from mjxgrad.rollouts import render
 from mjxgrad.scene import Scene
 
 _MOST_SIGNALS, _MOST_DOTS = 8, 300
-_FRAME = (240, 320)
 _SIZE = (4.6, 2.1)  # inches
 
 
@@ -34,7 +27,6 @@ class Identified:
         result: the result of the search.
         recordings: the fitted recordings.
         held_out: the held-out recordings.
-        seconds: duration of the search.
     """
 
     name: str
@@ -42,7 +34,6 @@ class Identified:
     result: Identification
     recordings: Sequence[Recording]
     held_out: Sequence[Recording]
-    seconds: float
 
     @property
     def is_sound(self) -> bool:
@@ -67,33 +58,6 @@ class Identified:
         rms, which = (result.rms, "error") if result.held_out_rms is None else (result.held_out_rms, "held-out error")
         return f"{found}: {which} {_percent(rms[1])} of the motion, {_percent(rms[0])} before."
 
-    def as_json(self) -> str:
-        """Return the result as JSON; numbers in SI units, null where undetermined."""
-        result = self.result
-        lower, upper = (
-            result.coordinates.unravel(np.asarray(x)) for x in (result.coordinates.lower, result.coordinates.upper)
-        )
-        parts = {"value": result.values, "half_width_95": result.half_width, "start": result.start}
-        parts |= {"lower": lower, "upper": upper}
-        table = {
-            "scene": self.name,
-            "headline": self.headline,
-            "parameters": {
-                name: {key: _plain(part[name]) for key, part in parts.items()} | {"unit": result.units.get(name, "")}
-                for name in result.values
-            },
-            "condition_number": _plain(result.condition_number),
-            "without_effect": result.without_effect,
-            "inseparable": result.inseparable,
-            "at_bounds": result.at_bounds,
-            "rms": result.rms,
-            "held_out_rms": result.held_out_rms,
-            "stopped": result.stopped.value,
-            "num_steps": result.num_steps,
-            "seconds": self.seconds,
-        }
-        return json.dumps(table, indent=2, ensure_ascii=False)
-
     def as_html(self) -> str:
         """Return the result as a self-contained page; needs `mjxgrad[render]`."""
         number, (head, *rows) = f"{self.result.condition_number:.2g}", self.result.rows()
@@ -102,7 +66,7 @@ class Identified:
         )
         faults = [text.strip() for text in self.result.warnings()]
         numbers = Block(faults=faults, items=[condition], table=Table(head, rows))
-        blocks = [self._video(), self._figures(), numbers, Block(folded="In words", code=self.result.summary())]
+        blocks = [self._figures(), numbers, Block(folded="In words", code=self.result.summary())]
         return page(self.headline, f"mjxgrad identify {self.name}", blocks)
 
     @property
@@ -110,24 +74,17 @@ class Identified:
         """The motion to show: the held-out end of a single recording, else the first recording."""
         return (self.held_out if len(self.recordings) == 1 and self.held_out else self.recordings)[0]
 
-    @functools.cached_property
-    def _courses(self) -> tuple[dict[str, np.ndarray], ...]:
+    def _figures(self) -> Block:
+        """Draw the signals, sorted by how much the search changed them."""
         window, found = jax.tree.map(lambda leaf: leaf[0], stack(self.scene, [self._shown])), self.result
         run = jax.jit(lambda scene, delay: simulated(scene, window, None, delay)[0])
         courses = [run(s, v.get("delay", 0.0)) for s, v in ((self.scene, found.start), (found.scene, found.values))]
-        return tuple(jax.tree.map(np.asarray, course) for course in courses)
-
-    def _measured(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return times and values of a signal, from the first fitted motion and the shown one."""
+        before, after = jax.tree.map(np.asarray, courses)
         motions = list({id(one): one for one in (self.recordings[0], self._shown)}.values())
-        return np.concatenate([m.times for m in motions]), np.concatenate([m.measured[name] for m in motions])
-
-    def _figures(self) -> Block:
-        """Draw the signals, sorted by how much the search changed them."""
-        before, after = self._courses
+        times = np.concatenate([motion.times for motion in motions])
         signals = []
         for name in self._shown.measured:
-            times, rows = self._measured(name)
+            rows = np.concatenate([motion.measured[name] for motion in motions])
             titles = _titles(self.scene, name, rows.shape[1])
             for title, values, old, new in zip(titles, rows.T, before[name].T, after[name].T, strict=True):
                 if (known := np.isfinite(values)).any():
@@ -161,28 +118,6 @@ class Identified:
         axis.set(xlabel="time, s", xlim=(0, end), ylim=(low - room, high + room))
         return figure
 
-    def _video(self) -> Block:
-        """Film the motion before and after, side by side, overlaid with the measured motion where it is complete."""
-        before, after = (course["qpos"] for course in self._courses)
-        film = functools.partial(render.frames, height=_FRAME[0], width=_FRAME[1])
-        at = float(self.scene.model.opt.timestep) * np.arange(len(before))
-        words = "Left: at the start of the search. Right: with the values found."
-        try:
-            shots = [film(self.scene, before), film(self.result.scene, after)]
-            if "qpos" in self._shown.measured:
-                times, rows = self._measured("qpos")
-                known = np.flatnonzero(np.isfinite(rows).all(axis=1))
-                known = known[np.argsort(times[known])]
-                if len(known) > 1 and times[known[-1]] >= (at[-1] + at[-2]) / 2:
-                    real = film(self.scene, rows[known][np.abs(times[known] - at[:, None]).argmin(axis=1)])
-                    shots = [((shot.astype(np.uint16) + real) // 2).astype(np.uint8) for shot in shots]
-                    words += " Both with what was measured drawn into them."
-            with tempfile.TemporaryDirectory() as folder:
-                render.write_video(path := Path(folder) / "motion.mp4", np.concatenate(shots, axis=2))
-                return Block(video=path.read_bytes(), caption=words)
-        except (RuntimeError, ValueError) as error:
-            return Block(text=f"No video: {error}")
-
 
 def _titles(scene: Scene, name: str, width: int) -> list[str]:
     """Return titles for the numbers of a signal: joints with units for positions and velocities, else indices."""
@@ -207,10 +142,3 @@ def _titles(scene: Scene, name: str, width: int) -> list[str]:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
-
-
-def _plain(value: ArrayLike) -> float | list | None:
-    """Return numbers for JSON; null where not finite."""
-    if np.ndim(value):
-        return [_plain(one) for one in np.asarray(value)]
-    return float(value) if np.isfinite(value) else None  # pyright: ignore[reportArgumentType]

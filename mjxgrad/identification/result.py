@@ -72,14 +72,14 @@ class Identification:
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         has_noise: whether the recordings state the noise of every signal.
         held_out_rms: the same for the held-out recordings; None without any.
-        offsets: changes of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
+        offsets: changes of the starts; None unless asked for.
         correlation: correlation of successive residuals of a signal. About 0 if only independent noise is left.
         removable: share of the sum of squares that the linear model at the end could still remove within the bounds. About 0
             at a minimum of a smooth motion.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
         stopped: the reason why the search ended.
-        scenes: the scenes with the identified values.
+        scene: the scene with the identified values.
         coordinates: bounds and names, for saving.
         units: units by name.
     """
@@ -96,20 +96,15 @@ class Identification:
     rms: tuple[float, float]
     has_noise: bool
     held_out_rms: tuple[float, float] | None
-    offsets: tuple[np.ndarray, ...] | None
+    offsets: Float[np.ndarray, "windows _"] | None
     correlation: float
     removable: float
     num_numbers: int
     num_steps: int
     stopped: Stopped
-    scenes: tuple[Scene, ...]
+    scene: Scene
     coordinates: Coordinates
     units: dict[str, str]
-
-    @property
-    def scene(self) -> Scene:
-        """The first, or only, scene with the identified values."""
-        return self.scenes[0]
 
     def summary(self) -> str:
         """Describe the result in text: the values with their intervals, then the warnings."""

@@ -87,7 +87,7 @@ def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():
     whole = np.column_stack(
         [shared.reshape(27, 2), np.kron(np.eye(3), np.ones((9, 2))) * np.tile(offsets.reshape(27, 2), 3)]
     )
-    flat, slope, count = _without_offsets([(residual, shared, offsets)])
+    flat, slope, count = _without_offsets(residual, shared, offsets)
     found = statistics(_coordinates(a=1.0, b=1.0), np.ones(2), flat, slope, 27, count)
     expected = (residual**2).sum() / (27 - 8) * np.linalg.inv(whole.T @ whole)[:2, :2]
     assert count == 6
