@@ -175,8 +175,6 @@ def sweep(
         seed: seed of all random numbers.
         html: the page to write.
     """
-    if not html.parent.is_dir():
-        raise CommandError(f"there is no folder {html.parent} for {html}")
     _writable(html, is_page=True)
     mg, log = _library(), _timed()
     found = mg.sweep(
@@ -203,7 +201,6 @@ def identify(
     *recordings: str,
     parameter: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")],
     held_out: float = 0.2,
-    window: float | None = None,
     free_start: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     output: Path = Path("identified"),
 ) -> int:
@@ -217,11 +214,10 @@ def identify(
     Args:
         scene: an MJCF file.
         recordings: CSV or NPZ files, before the options.
-        parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
+        parameter: kind:name or kind:name=low..high. Kinds are mass (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
             (actuators) and delay. kind:one,other is one value for both.
-        held_out: share for validation only: every n-th recording or window, or the end of a single one.
-        window: duration in s of windows to cut recordings into, each from its measured state.
+        held_out: share for validation only: every n-th recording, or the end of a single one.
         free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
     """
@@ -239,7 +235,7 @@ def identify(
         one, unknown = files.recording(loaded, _existing(path))
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
-        motions += [one] if window is None else one.cut(window, float(loaded.model.opt.timestep))
+        motions.append(one)
     fitted, judged = files.hold_out(loaded, motions, held_out)
     log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
     result = mg.identify(
@@ -251,14 +247,14 @@ def identify(
         free_start=free_start,
         log=lambda step, metrics: log(f"step {step}: error {100 * metrics['rms']:.3g} % of the motion"),
     )
-    found = page.Identified(Path(scene).name, loaded, result, fitted, judged)
-    print(f"{found.headline}\n\n{result.summary()}", flush=True)
+    print(f"{result.headline}\n\n{result.summary()}", flush=True)
     output.mkdir(parents=True, exist_ok=True)
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")
-    (output / "report.html").write_text(found.as_html(), encoding="utf-8")
+    text = page.identified_page(Path(scene).name, loaded, result, fitted, judged)
+    (output / "report.html").write_text(text, encoding="utf-8")
     log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
-    return 0 if found.is_sound else 1
+    return 0 if result.is_sound else 1
 
 
 @app.command

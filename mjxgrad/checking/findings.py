@@ -89,10 +89,6 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     if motions.idle:
         text = f"No effect: {', '.join(motions.idle)}. A change of the control changes no position."
         yield Finding("no_effect", text, True)
-    unfelt = [name for name in motions.unfelt if motions.touches or motions.touching or name != "friction"]
-    if unfelt:
-        text = f"A tenth more changes nothing in the tested motion: {_some(unfelt)}. Its derivative is zero."
-        yield Finding("note", text)
 
 
 def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:

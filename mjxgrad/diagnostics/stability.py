@@ -178,7 +178,7 @@ class StabilityReport:
         lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speed}"]
         if not self.springs:
             return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
-        lines += _aligned([self._columns, *self._rows()])
+        lines += _aligned([_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()])
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)
         return "\n".join(
@@ -187,10 +187,6 @@ class StabilityReport:
 
     def __str__(self) -> str:
         return self.summary()
-
-    @property
-    def _columns(self) -> tuple[str, ...]:
-        return _COLUMNS + _SPEED_COLUMNS * (self.speed is not None)
 
     def _rows(self) -> Iterator[tuple[str, ...]]:
         groups: dict[tuple[str, ...], list[Spring]] = {}

@@ -63,7 +63,7 @@ class Coordinates(eqx.Module):
         nominal: the nominal values.
         lower: the lower bounds.
         upper: the upper bounds.
-        names: one name per number, `mass` or `inertia[3]`.
+        names: one name per number, `mass` or `gains[1]`.
         shapes: name and shape of each parameter.
     """
 

@@ -63,7 +63,7 @@ def identify(
 
     Args:
         scene: the scene with nominal values.
-        parameters: parameters by name, from `mass`, `inertia`, `friction`, `softness` and the like, or a `Parameter` with its
+        parameters: parameters by name, from `mass`, `friction`, `softness` and the like, or a `Parameter` with its
             own `write`.
         recordings: recordings of the scene.
         held_out: recordings for validation only.
@@ -244,7 +244,7 @@ class _Program:
             found = np.asarray(self._run(self._sums, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
-        best = best_point(sums_at, low, high, np.cumsum(counts), _NUM_POINTS)
+        best = best_point(sums_at, low, high, np.cumsum(counts).astype(float), _NUM_POINTS)
         return None if best is None else jnp.asarray(best, dtype)
 
     def offsets(self, point: Array) -> Array | None:

@@ -209,7 +209,16 @@ def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
             lambda cart: stack(cart, [Recording({"speed": np.zeros(5)})]),
             "there is no sensor 'speed'; named sensors are 'place'",
         ),
+        (lambda cart: Recording({"place": np.zeros(3)}, np.zeros((3, 1))), "4 rows for 3 controls, one at each state"),
+        (
+            lambda cart: Recording({"place": np.zeros(3)}, noise={"place": 0.0}),
+            "noise of place of the recording must be positive",
+        ),
         (lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, []), "recordings must hold at least one"),
+        (
+            lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.full(5, np.nan)})]),
+            "got NaN alone",
+        ),
         (
             lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})], delay="b"),
             "delay must name one",
@@ -237,23 +246,6 @@ def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
     assert abs(right.values["gear"] - 3.0) < right.half_width["gear"]
     assert abs(right.correlation) < 0.47
     assert right.warnings() == []
-
-
-@pytest.mark.parametrize(
-    ("measured", "given", "said"),
-    [
-        (_course()[1:], {}, "41 rows for 40 controls, one at each state"),
-        (_course(), {"noise": {"place": 0.0}}, "noise of place of the recording must be positive"),
-        (np.full(41, np.nan), {}, "got NaN alone"),
-    ],
-)
-def test_what_a_recording_lacks_is_said(cart, measured, given, said):
-    with pytest.raises(ValueError, match=said):
-        mg.identify(
-            cart,
-            {"gear": identification.gear(cart, "motor")},
-            [Recording({"place": measured}, _DRIVE[:, None], **given)],
-        )
 
 
 def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, compilations):
