@@ -60,7 +60,7 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
     signals.sort(key=lambda one: -one[0])
     timestep = float(scene.model.opt.timestep)
     drawings = [
-        svg(lambda one=one: _panel(*one[1:], timestep, fitted_until), f"{one[1]} over time")
+        svg(lambda one=one: _panel(*one[1:], timestep=timestep, fitted_until=fitted_until), f"{one[1]} over time")
         for one in signals[:_MOST_SIGNALS]
     ]
     caption = (

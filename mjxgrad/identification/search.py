@@ -211,7 +211,8 @@ class _Program:
 
         def of_window(vector: Array, window: Windows) -> Array:
             squares = self._residuals(vector, None, window) ** 2
-            return sum(part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends))
+            of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
+            return jnp.stack(of_rows).sum(axis=0)
 
         def of_one(vector: Array) -> Array:
             return jnp.cumsum(jax.vmap(functools.partial(of_window, vector))(windows).sum(axis=0))
