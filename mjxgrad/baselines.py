@@ -127,8 +127,10 @@ def search_stddev(
     as_objective(objective)
     whole("num_samples", num_samples, 2)
     dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1
-    if stddev is None:
-        stddev = _parameter_stddev(objective, dim)
+    if stddev is None and isinstance(objective, OpenLoop):
+        return jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape))
+    if stddev is None and isinstance(objective, ParameterNoise):
+        return jnp.broadcast_to(objective.stddev, (dim,))
     if stddev is None:
         raise ValueError(
             f"stddev must be given for {type(objective).__name__}, whose noise is not on the parameters; "
@@ -140,15 +142,6 @@ def search_stddev(
     if not bool((width > 0).all()):
         raise ValueError(f"stddev must be positive, got {stddev}")
     return jnp.broadcast_to(width, (dim,))
-
-
-def _parameter_stddev(objective: Objective, dim: int) -> Float[Array, " dim"] | None:
-    """Return the standard deviation of the noise on each parameter, or None if the noise is elsewhere."""
-    if isinstance(objective, OpenLoop):
-        return jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape))
-    if isinstance(objective, ParameterNoise):
-        return jnp.broadcast_to(objective.stddev, (dim,))
-    return None
 
 
 def _record(

@@ -1,4 +1,4 @@
-"""The command line: check and sweep a scene, find its parameters, begin a program, film it."""
+"""The command line: check and sweep a scene, find its parameters, begin a program."""
 
 import functools
 import importlib
@@ -11,8 +11,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
-
-import numpy as np
 
 try:
     import cyclopts
@@ -120,7 +118,6 @@ def check(
     scene: str,
     *,
     cost: str | None = None,
-    as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False,
     html: Path | None = None,
     quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     budget: float = 12.0,
@@ -131,7 +128,6 @@ def check(
     Args:
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; modules of the current folder, too.
-        as_json: write JSON.
         html: write a page to this file.
         quick: only fast checks, in seconds: contact, time step, parts without effect.
         budget: duration in s once the scene is loaded; the report names measurements that are left out.
@@ -141,7 +137,7 @@ def check(
     mg, log = _library(), _timed()
     function = None if cost is None else importlib.import_module("mjxgrad.checking.sweep").load_function(cost)
     verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
-    print(verdict.as_json() if as_json else verdict.summary(), flush=True)
+    print(verdict, flush=True)
     if html is not None:
         html.write_text(verdict.as_html(), encoding="utf-8")
         log(f"wrote {html}")
@@ -179,8 +175,6 @@ def sweep(
         seed: seed of all random numbers.
         html: the page to write.
     """
-    if not html.parent.is_dir():
-        raise CommandError(f"there is no folder {html.parent} for {html}")
     _writable(html, is_page=True)
     mg, log = _library(), _timed()
     found = mg.sweep(
@@ -207,10 +201,8 @@ def identify(
     *recordings: str,
     parameter: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")],
     held_out: float = 0.2,
-    window: float | None = None,
     free_start: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     output: Path = Path("identified"),
-    as_json: Annotated[bool, cyclopts.Parameter(name="--json", negative="")] = False,
 ) -> int:
     """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
 
@@ -222,17 +214,15 @@ def identify(
     Args:
         scene: an MJCF file.
         recordings: CSV or NPZ files, before the options.
-        parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
+        parameter: kind:name or kind:name=low..high. Kinds are mass (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
             (actuators) and delay. kind:one,other is one value for both.
-        held_out: share for validation only: every n-th recording or window, or the end of a single one.
-        window: duration in s of windows to cut recordings into, each from its measured state.
+        held_out: share for validation only: every n-th recording, or the end of a single one.
         free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
-        as_json: write JSON.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
-    mg, log, started = _library(), _timed(), time.monotonic()
+    mg, log = _library(), _timed()
     files, page = (
         importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "identification.page")
     )
@@ -245,7 +235,7 @@ def identify(
         one, unknown = files.recording(loaded, _existing(path))
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
-        motions += [one] if window is None else one.cut(window, float(loaded.model.opt.timestep))
+        motions.append(one)
     fitted, judged = files.hold_out(loaded, motions, held_out)
     log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
     result = mg.identify(
@@ -257,14 +247,14 @@ def identify(
         free_start=free_start,
         log=lambda step, metrics: log(f"step {step}: error {100 * metrics['rms']:.3g} % of the motion"),
     )
-    found = page.Identified(Path(scene).name, loaded, result, fitted, judged, time.monotonic() - started)
-    print(found.as_json() if as_json else f"{found.headline}\n\n{result.summary()}", flush=True)
+    print(f"{result.headline}\n\n{result.summary()}", flush=True)
     output.mkdir(parents=True, exist_ok=True)
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")
-    (output / "report.html").write_text(found.as_html(), encoding="utf-8")
+    text = page.identified_page(Path(scene).name, loaded, result, fitted, judged)
+    (output / "report.html").write_text(text, encoding="utf-8")
     log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
-    return 0 if found.is_sound else 1
+    return 0 if result.is_sound else 1
 
 
 @app.command
@@ -303,38 +293,6 @@ def new(
     print(f"wrote {output}: write your cost into it, then python {output}")
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")
-
-
-@app.command
-def render(scene: str, qpos: Path | None = None, *, output: Path = Path("scene.mp4"), speed: float = 1.0) -> None:
-    """Film a scene: a recorded motion, or a random one.
-
-    Args:
-        scene: an MJCF file.
-        qpos: an NPZ or NPY file with positions (states, nq), in an NPZ under the name qpos; one state per time step.
-        output: the video to write.
-        speed: simulated over shown time.
-    """
-    mg = _library()
-    loaded = mg.load_scene(_existing(scene))
-    if qpos is None:
-        from mjxgrad.checking.motions import random_motions
-
-        states = random_motions(loaded, np.random.default_rng(0)).qpos[0]
-    else:
-        try:
-            found = np.load(_existing(str(qpos)))
-        except (ValueError, EOFError) as error:
-            raise CommandError(f"{qpos} must be an NPZ or NPY file with positions, one state in each row") from error
-        if not isinstance(found, np.ndarray):
-            if "qpos" not in found:
-                raise CommandError(f"{qpos} must hold an array named qpos, got {', '.join(found) or 'none'}")
-            found = found["qpos"]
-        states = found
-        if states.ndim != 2 or states.shape[1] != loaded.model.nq:
-            raise CommandError(f"qpos must have {loaded.model.nq} numbers for each state, got shape {states.shape}")
-    mg.render.write_video(output, mg.render.frames(loaded, states, speed=speed))
-    print(output)
 
 
 @functools.cache

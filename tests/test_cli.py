@@ -1,12 +1,10 @@
 """The command line: what it prints where, its exit codes, and what it writes."""
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import mjxgrad as mg
@@ -33,11 +31,10 @@ def test_check_prints_its_verdict_and_says_no_fault_by_its_exit_code(scene, caps
     assert "First to touch" in said.err
 
 
-def test_json_is_all_that_is_on_standard_output(scene, capsys):
+def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
     Path(scene).write_text(SCENE.format(gear=0))
-    assert cli.main(["check", scene, "--quick", "--json", "--html", "page.html"]) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert [one["kind"] for one in found["findings"] if one["is_fault"]] == ["no_effect"]
+    assert cli.main(["check", scene, "--quick", "--html", "page.html"]) == 1
+    assert "! No effect: actuator 'push'" in capsys.readouterr().out
     assert Path("page.html").read_text().startswith("<!DOCTYPE html>")
 
 
@@ -54,32 +51,6 @@ def test_json_is_all_that_is_on_standard_output(scene, capsys):
 def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said):
     Path("refused.xml").write_text("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
     assert cli.main(arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
-
-
-@pytest.mark.parametrize("name", ["motion.npy", "motion.npz"])
-def test_positions_are_filmed_from_either_kind_of_file(scene, capsys, monkeypatch, name):
-    seen = []
-    monkeypatch.setattr(mg.render, "frames", lambda _, states, **__: seen.append(states))
-    monkeypatch.setattr(mg.render, "write_video", lambda *_: None)
-    states = np.linspace(0, 1, 5)[:, None]
-    np.save(name, states) if name.endswith("npy") else np.savez(name, qpos=states)
-    assert cli.main(["render", scene, name]) == 0
-    np.testing.assert_array_equal(seen[0], states)
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (lambda path: path.write_text("time,z\n0,1\n"), "must be an NPZ or NPY file"),
-        (lambda path: np.savez(path, q=np.zeros((2, 1))), "array named qpos, got q"),
-        (lambda path: np.savez(path, qpos=np.zeros((2, 3))), "1 numbers for each state, got shape (2, 3)"),
-    ],
-)
-def test_positions_that_cannot_be_filmed_are_refused_in_one_line(scene, capsys, content, said):
-    content(Path("motion.npz"))
-    assert cli.main(["render", scene, "motion.npz"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
 

@@ -2,14 +2,12 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import mujoco
@@ -26,18 +24,16 @@ from mjxgrad.checking.findings import (
     left_out_findings,
     measured_findings,
     recommend,
-    slopes,
     static_findings,
     touch_speed,
 )
-from mjxgrad.checking.measure import Measured, measure
+from mjxgrad.checking.measure import Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.checking.moving import Mover, Outcomes
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page
 from mjxgrad.rollouts import Trajectory
-from mjxgrad.scene import Scene, SceneError, load_scene
-from mjxgrad.stepping import Engine
+from mjxgrad.scene import Scene, load_scene
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -64,7 +60,6 @@ class Verdict:
         stability: stability of each contact at the time step.
         motions: motions by C MuJoCo.
         measured: measurements of derivatives; None if derivatives were not asked for.
-        seconds: duration of each part.
     """
 
     name: str
@@ -77,7 +72,6 @@ class Verdict:
     stability: StabilityReport
     motions: Motions
     measured: Measured | None
-    seconds: dict[str, float]
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -97,39 +91,13 @@ class Verdict:
 
     def _details(self) -> dict[str, str]:
         """Return the detailed report: measurements, scene, time step."""
-        spent = ", ".join(f"{part} {seconds:.0f} s" for part, seconds in self.seconds.items())
         of_what = [] if self.measured is None else [f"Outcomes: {'; '.join(self.outcomes)}."]
-        rows = [_noise_row(noise) for noise in (() if self.measured is None else self.measured.noises)]
-        noises = [
-            f"Noise {row['stddev']:g}, {'the file' if row['stiffness'] is None else format_number(row['stiffness'])}: variance "
-            f"{_numbers(row['first_variance'])} of first order, {_numbers(row['zeroth_variance'])} of zeroth; "
-            f"first less zeroth {_numbers(row['bias'])} ± {_numbers(row['bias_error'])}"
-            for row in rows
-        ]
+        noises = [] if self.measured is None else map(_noise_text, self.measured.noises)
         return {
-            "What was measured": "\n".join([*of_what, *noises, f"Time: {spent}."]),
+            "What was measured": "\n".join([*of_what, *noises]) or "Nothing.",
             "The scene": self.scene.summary(),
             "Time step and contacts": self.stability.summary(),
         }
-
-    def as_json(self) -> str:
-        """Return the verdict as JSON; numbers in SI units."""
-        measured = self.measured
-        table: dict[str, Any] = {
-            "scene": self.name,
-            "headline": self.headline,
-            "findings": [asdict(finding) for finding in self.findings],
-            "recommendation": asdict(self.recommendation),
-            "code": self.code,
-            "outcomes": self.outcomes,
-            "touches": [asdict(touch) for touch in self.motions.touches],
-            "slopes": [] if measured is None else [asdict(one) for one in slopes(measured)],
-            "noise": [] if measured is None else list(map(_noise_row, measured.noises)),
-            "omissions": [asdict(one) for one in self.scene.omissions],
-            "conversions": [asdict(one) for one in self.scene.conversions],
-            "seconds": self.seconds,
-        }
-        return json.dumps(table, indent=2, ensure_ascii=False, default=str)
 
     def as_html(self) -> str:
         """Return the verdict as a self-contained page; needs `mjxgrad[render]`."""
@@ -146,7 +114,6 @@ def check(
     cost: Cost | None = None,
     *,
     derivatives: bool = True,
-    engine: Engine = "mujoco",
     budget: int | float = 12.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
@@ -162,8 +129,6 @@ def check(
         cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it; motions are then simulated
             from their start. None uses random mixes of final positions and velocities.
         derivatives: whether to measure derivatives; False looks at motions alone.
-        engine: "mujoco" measures by C MuJoCo without compilation; "mjx" measures by the step that a GPU would run, and needs
-            a budget of minutes.
         budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
             measurements that are left out.
         seed: seed of all random numbers.
@@ -179,30 +144,27 @@ def check(
     if not budget > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
     say = log or (lambda _: None)
-    rng, started = np.random.default_rng(seed), time.perf_counter()
+    rng = np.random.default_rng(seed)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene, path = _load(source)
-        spent = {"loading": time.perf_counter() - started}
+        started = time.perf_counter()
         motions = random_motions(scene, rng)
         scene, max_contacts = _with_room(scene, motions)
         stability = check_stability(scene, speed=touch_speed(motions))
-    spent["motions"] = time.perf_counter() - started - spent["loading"]
     found = [*static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = _outcomes(scene, cost, rng)
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
-        say(f"measuring derivatives by {'MJX, which compiles first' if engine == 'mjx' else 'C MuJoCo'}")
-        measuring = time.perf_counter()
-        mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + spent["loading"] + budget, engine)
+        say("measuring derivatives by C MuJoCo")
+        mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
         with contextlib.suppress(TimeoutError):
             measured = measure(
                 scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
             )
         found += measured_findings(measured) if measured and measured.lines else ()
-        spent["measuring"] = time.perf_counter() - measuring
         found += left_out_findings(measured if measured and measured.lines else None, budget)
     advice = recommend(scene, motions, stability, measured, max_contacts)
     return Verdict(
@@ -216,7 +178,6 @@ def check(
         stability=stability,
         motions=motions,
         measured=measured,
-        seconds=spent,
     )
 
 
@@ -224,11 +185,6 @@ def _load(source: Source) -> tuple[Scene, str]:
     """Return the scene, and the name of its file in code."""
     if isinstance(source, Scene):
         return source, "scene.xml"
-    if isinstance(source, mujoco.MjSpec):
-        try:
-            source = source.compile()
-        except ValueError as error:
-            raise SceneError(f"the MjSpec must be one that MuJoCo compiles, but it says: {error}") from error
     is_text = isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<")
     is_file = isinstance(source, str | os.PathLike) and not is_text
     return load_scene(source), str(source) if is_file else "scene.xml"
@@ -272,22 +228,16 @@ def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tupl
     return tuple(words), lambda t: jnp.concatenate([mix @ end for mix, end in zip(mixes, ends(t), strict=True)])
 
 
-def _noise_row(noise) -> dict[str, Any]:
-    bias = np.asarray(noise.first.value - noise.zeroth.value)[-1, :, 0]
-    error = np.hypot(np.asarray(noise.first.standard_error), np.asarray(noise.zeroth.standard_error))[-1, :, 0]
-    return {
-        "stddev": noise.stddev,
-        "stiffness": noise.stiffness,
-        "first_variance": np.asarray(noise.first.variance)[-1].tolist(),
-        "zeroth_variance": np.asarray(noise.zeroth.variance)[-1].tolist(),
-        "bias": bias.tolist(),
-        "bias_error": error.tolist(),
-        "first_is_better_until": noise.crossover.horizon,
-    }
-
-
-def _numbers(values: list[float]) -> str:
-    return ", ".join(f"{value:.2g}" for value in values)
+def _noise_text(noise: Noise) -> str:
+    """Return variances and bias at the last time, one number per outcome."""
+    first, zeroth = noise.first[:, -1], noise.zeroth[:, -1]
+    variances = [one.var(axis=0, ddof=1) for one in (first, zeroth)]
+    error = np.sqrt(sum(variances) / len(first))
+    columns = *variances, first.mean(axis=0) - zeroth.mean(axis=0), error
+    of_first, of_zeroth, bias, off = (", ".join(f"{x:.2g}" for x in one) for one in columns)
+    where = "the file" if noise.stiffness is None else format_number(noise.stiffness)
+    told = f"variance {of_first} of first order, {of_zeroth} of zeroth; first less zeroth {bias} ± {off}"
+    return f"Noise {noise.stddev:g}, {where}: {told}"
 
 
 def _code(scene: Scene, advice: Recommendation, path: str) -> str:

@@ -89,10 +89,6 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     if motions.idle:
         text = f"No effect: {', '.join(motions.idle)}. A change of the control changes no position."
         yield Finding("no_effect", text, True)
-    unfelt = [name for name in motions.unfelt if motions.touches or motions.touching or name != "friction"]
-    if unfelt:
-        text = f"A tenth more changes nothing in the tested motion: {_some(unfelt)}. Its derivative is zero."
-        yield Finding("note", text)
 
 
 def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
@@ -130,7 +126,7 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     if num_diverged:
         yield Finding("not_finite", f"{num_diverged} motions along the lines diverged: shorten the time step.", True)
     if scattered := [one for one in measured.noises if one.stiffness is None and one.advantage < 1]:
-        until = min(one.crossover.horizon for one in scattered)
+        until = min(one.crossover for one in scattered)
         text = f"Derivatives of single motions scatter more than zeroth order from {until:.2g} s on."
         yield Finding("explodes", text + " Shorten the horizon or soften the contact.", True)
     yield _slope_finding(slopes(measured))
@@ -177,7 +173,7 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         felt = [one for one in measured.noises if (one.stiffness is None) == is_own and not np.isnan(one.advantage)]
         if not felt:
             continue
-        until = min(one.crossover.horizon for one in felt)
+        until = min(one.crossover for one in felt)
         ends = f"It is better up to {until:.2g} s" if math.isfinite(until) else "It is better as far as measured"
         stiffness = felt[0].stiffness
         lead = "One" if stiffness is None else f"With all contacts at {format_number(stiffness)} 1/s² one"
@@ -236,7 +232,7 @@ def recommend(
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
     softer = [noise for noise in measured.noises if noise.stiffness is not None and noise.stddev == stddev]
-    limits = [noise.crossover.horizon for noise in own]
+    limits = [noise.crossover for noise in own]
     limits += [
         float(t)
         for line in measured.lines

@@ -8,19 +8,14 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjxgrad._text import format_number
 from mjxgrad.checking.motions import Motions, half_range, pairs_at, smooth
 from mjxgrad.checking.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
 from mjxgrad.contact import Softness
-from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
-from mjxgrad.estimators import GradientEstimate
-from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
-from mjxgrad.estimators.samples import Plan, Samples
-from mjxgrad.objective.base import unchanged
 from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
 
@@ -75,21 +70,21 @@ class Noise:
     Attributes:
         stddev: standard deviation, see `STDDEVS`.
         stiffness: stiffness of all contacts in 1/s²; None is the file's.
-        first: first-order estimates, by time and outcome.
-        zeroth: zeroth-order estimates from the same motions.
+        first: first-order estimates by single motions.
+        zeroth: zeroth-order estimates by the same motions.
         crossover: the time from which zeroth order is at least as good, in s.
     """
 
     stddev: float
     stiffness: float | None
-    first: GradientEstimate
-    zeroth: GradientEstimate
-    crossover: Crossover
+    first: Float[np.ndarray, "motions times outcomes"]
+    zeroth: Float[np.ndarray, "motions times outcomes"]
+    crossover: float
 
     @property
     def advantage(self) -> float:
         """The ratio of samples that zeroth and first order need at the last time, as the median over outcomes."""
-        first, zeroth = (np.asarray(one.variance)[-1] for one in (self.first, self.zeroth))
+        first, zeroth = (one[:, -1].var(axis=0) for one in (self.first, self.zeroth))
         is_felt = zeroth > _UNFELT**2 * np.nanmax(zeroth, initial=0.0)
         return (
             float(np.median(zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])))
@@ -132,8 +127,8 @@ def measure(
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
     speed = max((touch.speed for touch in motions.touches), default=0.0) or 1.0
     directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
-    softness = _softer(scene)
-    settings = [(stddev, soft) for soft in ([None] if softness is None else [None, softness]) for stddev in STDDEVS]
+    softer = [SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))] if scene.pairs else []
+    settings = [(stddev, soft) for soft in [None, *softer] for stddev in STDDEVS]
     lines = [
         (f"a line along {one[0]}", _LINE_BATCHES, functools.partial(probe.line, *at, *one))
         for at, one in zip(chosen, directions, strict=True)
@@ -210,12 +205,6 @@ def _direction(
     given = (1.0 * has_start, wide * has_start, wide * has_controls)
     words = ["the start"] * has_start + ["the controls"] * has_controls
     return " and ".join(words), Direction(*(part * share for part, share in zip(parts, given, strict=True)))
-
-
-def _softer(scene: Scene) -> float | None:
-    if not scene.pairs:
-        return None
-    return SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))
 
 
 @dataclass(frozen=True)
@@ -304,47 +293,45 @@ class _Probe:
         # An outcome depends only on the noise of earlier steps.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
-        first, zeroth = _estimates(found.outcomes, found.derivatives, scores[:, :, None])
+        first, zeroth = estimates(found.outcomes, found.derivatives, scores[:, :, None])
         times = np.array(self.lengths) * self.motions.timestep
-        return Noise(stddev, stiffness, first, zeroth, _crossover(times, found, scores[:, :, None], zeroth))
+        return Noise(stddev, stiffness, first, zeroth, _crossover(times, first, zeroth))
 
 
-def _estimates(
-    costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray
-) -> tuple[GradientEstimate, GradientEstimate]:
-    """Return both estimates from given motions, by time and outcome."""
-    plan = Plan(len(costs), with_gradient=True, with_score=True)
-
-    def of_one(costs: Array, derivatives: Array, scores: Array) -> tuple[GradientEstimate, GradientEstimate]:
-        column, yes = costs[:, None], jnp.ones(len(costs), bool)
-        samples = Samples(
-            column,
-            derivatives[:, None, None],
-            scores[:, None, None],
-            jnp.full_like(scores, jnp.nan)[:, None, None],
-            jax.tree_util.Partial(unchanged),
-            is_noisy=yes,
-            is_noise_free=~yes,
-            zero_noise_costs=jnp.zeros_like(costs),
-            has_no_effect=~yes,
-        )
-        return both_results(both_summary(samples), plan, "leave_one_out", unchanged)
-
-    flat = [jnp.asarray(np.broadcast_to(x, costs.shape).reshape(len(costs), -1)) for x in (costs, derivatives, scores)]
-    found = jax.jit(jax.vmap(of_one, in_axes=1))(*flat)
-    return jax.tree.map(lambda leaf: leaf.reshape(*costs.shape[1:], *leaf.shape[1:]), found)
+def estimates(costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return single estimates of first and zeroth order by motion, time and outcome, of finite motions; NaN of fewer than two."""
+    is_finite = np.isfinite(costs).all(axis=(1, 2)) & np.isfinite(derivatives).all(axis=(1, 2))
+    if is_finite.sum() < 2:
+        return np.full_like(costs[:2], np.nan), np.full_like(costs[:2], np.nan)
+    costs, derivatives, scores = costs[is_finite], derivatives[is_finite], scores[is_finite]
+    # The baseline leaves the motion itself out.
+    baselines = (costs.sum(axis=0) - costs) / (len(costs) - 1)
+    return derivatives, (costs - baselines) * scores
 
 
-def _crossover(times: np.ndarray, found: Moved, scores: np.ndarray, zeroth: GradientEstimate) -> Crossover:
+def _crossover(times: np.ndarray, first: np.ndarray, zeroth: np.ndarray) -> float:
     """Return the time from which single zeroth-order samples are as accurate, with equal weight for all outcomes."""
-    is_finite = np.isfinite(found.outcomes).all(axis=(1, 2)) & np.isfinite(found.derivatives).all(axis=(1, 2))
-    costs, derivatives, scores = (x[is_finite] for x in (found.outcomes, found.derivatives, scores))
-    if len(costs) < 2:
-        return Crossover(float(times[0]), float(times[0]), float(times[0]), np.zeros(len(times)))
-    terms = (costs - costs.mean(axis=0)) * scores * len(costs) / (len(costs) - 1)
-    truth = np.asarray(zeroth.value)[..., 0]
-    squares = [(one - truth) ** 2 for one in (derivatives, terms)]
-    weight = squares[1].mean(axis=0)
-    weight = np.where(weight > _UNFELT**2 * weight.max(), weight, np.inf)
-    shares = [(square / weight).sum(axis=2) for square in squares]
-    return crossover(times, *shares, num_resamples=200)
+    if np.isnan(first).any():
+        return float(times[0])
+    squares = [((one - zeroth.mean(axis=0)) ** 2).mean(axis=0) for one in (first, zeroth)]
+    weight = np.where(squares[1] > _UNFELT**2 * squares[1].max(), squares[1], np.inf)
+    return crossing(times, *((square / weight).sum(axis=1) for square in squares))
+
+
+def crossing(
+    times: Float[np.ndarray, " times"], first: Float[np.ndarray, " times"], second: Float[np.ndarray, " times"]
+) -> float:
+    """Return the time from which the second of two mean squared errors is at most the first.
+
+    It follows the last time at which the first is smaller, so brief draws before it do not count. The logarithm of their
+    ratio is interpolated. It is infinite without a crossing, and the first time if the second is smaller throughout.
+    """
+    tiny = np.finfo(float).tiny  # two errors of zero are equal
+    log_ratio = np.log(np.maximum(first, tiny)) - np.log(np.maximum(second, tiny))
+    if not (log_ratio < 0).any():
+        return float(times[0])
+    last = int(np.flatnonzero(log_ratio < 0)[-1])
+    if last == len(times) - 1:
+        return np.inf
+    below, above = log_ratio[last], log_ratio[last + 1]
+    return float(times[last] - below / (above - below) * (times[last + 1] - times[last]))

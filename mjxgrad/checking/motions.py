@@ -53,7 +53,6 @@ class Motions:
         touches: pairs that begin to touch, in order of time.
         touching: pairs in contact from the first step on.
         idle: actuators whose control has no effect.
-        unfelt: masses and frictions whose change by a tenth has no effect.
     """
 
     poses: tuple[str, ...]
@@ -67,7 +66,6 @@ class Motions:
     touches: tuple[Touch, ...]
     touching: tuple[str, ...]
     idle: tuple[str, ...]
-    unfelt: tuple[str, ...]
 
     @property
     def seconds(self) -> float:
@@ -123,8 +121,7 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
         onsets=onsets,
         touches=touches,
         touching=touching,
-        idle=_without_effect(model, start, window, _actuators(model, window, half)),
-        unfelt=_without_effect(model, start, window, _parameters(model, window)),
+        idle=_idle(model, start, window, half),
     )
 
 
@@ -213,39 +210,13 @@ def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"]
     return frozenset([touch.pair for touch in touches]) | frozenset(touching)
 
 
-def _without_effect(
-    model: mujoco.MjModel,
-    start: tuple[np.ndarray, ...],
-    controls: np.ndarray,
-    changes: Iterator[tuple[str, np.ndarray]],
+def _idle(
+    model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.ndarray, half: np.ndarray
 ) -> tuple[str, ...]:
-    """Return the names of changes that leave a motion unchanged; each change of the model lasts until the next."""
+    """Return the names of the actuators whose control changes nothing in a motion."""
     usual, found = _roll(model, start, controls), []
-    for name, changed in changes:
-        other = _roll(model, start, changed)
-        if max(np.abs(other[i] - usual[i]).max(initial=0.0) for i in range(2)) < _SMALLEST_EFFECT:
-            found.append(name)
-    return tuple(found)
-
-
-def _actuators(model: mujoco.MjModel, controls: np.ndarray, half: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     for i, size in enumerate(half):
-        change = np.where(np.arange(model.nu) == i, (1 - _REACH) * size, 0.0)
-        yield element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i), controls + change
-
-
-def _parameters(model: mujoco.MjModel, controls: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Change the model in place: a tenth more mass of one body at a time, or a tenth more friction everywhere."""
-    kept = (model.body_mass.copy(), model.body_inertia.copy(), model.geom_friction.copy(), model.pair_friction.copy())
-    moving = np.flatnonzero((model.body_weldid > 0) & (model.body_mass > 0)).tolist()
-    for body in [*moving, None]:
-        if body is None:
-            model.geom_friction *= 1.1
-            model.pair_friction *= 1.1
-        else:
-            model.body_mass[body] *= 1.1
-            model.body_inertia[body] *= 1.1
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-        yield "friction" if body is None else f"mass of {element_name(model, mujoco.mjtObj.mjOBJ_BODY, body)}", controls
-        model.body_mass[:], model.body_inertia[:], model.geom_friction[:], model.pair_friction[:] = kept
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+        other = _roll(model, start, controls + np.where(np.arange(model.nu) == i, (1 - _REACH) * size, 0.0))
+        if max(np.abs(other[k] - usual[k]).max(initial=0.0) for k in range(2)) < _SMALLEST_EFFECT:
+            found.append(element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i))
+    return tuple(found)

@@ -1,8 +1,4 @@
-"""Batches of motions with their derivatives along one direction, by C MuJoCo or MJX, for all measurements.
-
-C MuJoCo propagates a tangent step by step without compilation: a quadruped takes seconds. MJX's step is the one that a GPU
-runs; its derivatives compile for a minute. Contact parameters are arguments of both.
-"""
+"""Batches of motions with their derivatives along one direction, by C MuJoCo, which compiles nothing."""
 
 import dataclasses
 import math
@@ -20,12 +16,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.batched import device
-from mjxgrad.native.derivative import to_coordinates, to_tangent
+from mjxgrad.native.derivative import to_coordinates
 from mjxgrad.native.engine import engine_of
 from mjxgrad.objective.task import finite_cost
-from mjxgrad.rollouts import State, Trajectory, rollout
+from mjxgrad.rollouts import State, Trajectory
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import own_motion
 
 Kind = Literal["slope", "discrete", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")
@@ -34,7 +29,6 @@ REFINED = 4
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 # XLA's optimisation level 1 halves the time to compile (hopper, jax 0.10.2: 12 s in place of 24); the code is as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-_TINY = 1e-5  # m, rad: step of a central difference through the exponential map; its error is second order
 _VELOCITY_LIMIT = 1e4
 
 Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
@@ -86,19 +80,16 @@ class Mover:
         size: number of motions in a batch.
         outcomes: function from a trajectory to its outcomes.
         end: latest start of a batch, by `time.perf_counter`.
-        engine: "mujoco" or "mjx".
     """
 
     scene: Scene
     size: int
     outcomes: Outcomes
     end: float = math.inf
-    engine: Literal["mjx", "mujoco"] = "mujoco"
 
     def __post_init__(self):
         self.contact = contact_of(self.scene.model)
         self._judges: dict[tuple[int, ...], Callable] = {}
-        self._compiled: dict[tuple[str, int], Callable] = {}
         self._num_steps, self._seconds = 0, 0.0
 
     @property
@@ -128,16 +119,18 @@ class Mover:
         pushes = np.broadcast_to(direction.controls[:steps], controls.shape)
         change = np.concatenate([direction.positions, direction.velocities, np.zeros(start["act"].shape[1])])
         contact = self.contact if contact is None else contact
-        by = self._by_mjx if self.engine == "mjx" and kind != "fine" else self._by_mujoco
         started = time.perf_counter()
-        path, course = by(kind, start, controls, (np.tile(change, (num, 1)), pushes), contact)
+        path, course = self._run(kind, start, controls, (np.tile(change, (num, 1)), pushes), contact)
         self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
         bad = ~np.all(np.abs(np.nan_to_num(path[1], nan=np.inf)) < _VELOCITY_LIMIT, axis=(1, 2))
         path = [np.concatenate([start[k][:, None], x], axis=1) for k, x in zip(start, path, strict=True)]
         path = [np.where(bad[:, None, None], part[:, :1], part) for part in path]
         nv = self.scene.model.nv
         course = np.concatenate([np.tile(change, (num, 1, 1)), np.where(bad[:, None, None], 0.0, course)], axis=1)
-        coordinates = self._turned(to_coordinates, path[0], course[..., :nv])
+        coordinates = course[..., :nv]
+        if self.scene.model.nq != nv:
+            places = jnp.asarray(path[0])
+            coordinates = np.asarray(_coordinates(self.scene, places, jnp.asarray(coordinates, places.dtype)))
         outcomes, derivatives = self._judge(tuple(lengths))(
             (*path, controls, bad), (coordinates, course[..., nv : 2 * nv], course[..., 2 * nv :], pushes)
         )
@@ -145,8 +138,8 @@ class Mover:
         first = np.linalg.norm(change)
         return Moved(np.asarray(outcomes), np.asarray(derivatives), size / (first or 1.0), int(bad.sum()))
 
-    def _by_mujoco(self, kind: Kind, start: dict, controls: np.ndarray, changes: tuple, contact: dict) -> tuple:
-        """Return the path and its tangent, by C MuJoCo."""
+    def _run(self, kind: Kind, start: dict, controls: np.ndarray, changes: tuple, contact: dict) -> tuple:
+        """Return the path and its tangent."""
         # The batch shares them, without a leading axis.
         engine, numbers = engine_of(self.scene.mj_model), {k: np.asarray(v)[None] for k, v in contact.items()}
         given = {"time": np.zeros((len(controls), 1)), **start}
@@ -157,40 +150,6 @@ class Mover:
             return path, np.full((*controls.shape[:2], changes[0].shape[1]), np.nan)
         found = engine.follow(kind, numbers, given, {"ctrl": controls}, changes)
         return [found[k] for k in start], found["change"]
-
-    def _by_mjx(self, kind: Kind, start: dict, controls: np.ndarray, changes: tuple, contact: dict) -> tuple:
-        """Return the path and its tangent by MJX's step; compiled once for each kind and number of steps."""
-        scene, nv, dtype = self.scene, self.scene.model.nv, self.scene.data.qpos.dtype
-        moves = change_of_poses(scene.mj_model, start["qpos"], changes[0][0, :nv])
-        tangents = (moves, changes[0][:, nv : 2 * nv], changes[0][:, 2 * nv :], changes[1])
-
-        def one(contact: dict, primals: tuple, tangents: tuple) -> tuple:
-            def run(qpos: Array, qvel: Array, act: Array, ctrl: Array) -> tuple:
-                state = State(qpos, qvel, act, jnp.zeros((), dtype), jnp.zeros_like(qvel))
-                course = rollout(
-                    eqx.tree_at(lambda s: s.model, scene, scene.model.replace(**contact)),
-                    state,
-                    ctrl,
-                    contact=own_motion(kind, "mjx"),
-                    checkpoint=False,
-                )
-                return course.qpos[1:], course.qvel[1:], jnp.asarray(course.act)[1:]
-
-            return jax.jvp(run, primals, tangents)
-
-        given = jax.tree.map(lambda x: jnp.asarray(x, dtype), ((*start.values(), controls), tangents))
-        key = (kind, controls.shape[1])
-        if key not in self._compiled:
-            lowered = jax.jit(jax.vmap(one, in_axes=(None, 0, 0))).lower(contact, *given)
-            self._compiled[key] = lowered.compile(compiler_options=compiler_options())
-        path, (turned, *rest) = jax.tree.map(lambda x: np.asarray(x, float), self._compiled[key](contact, *given))
-        return list(path), np.concatenate([self._turned(to_tangent, path[0], turned), *rest], axis=2)
-
-    def _turned(self, convert: Callable, qpos: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """Return the tangents of poses as changes of coordinates, or the reverse."""
-        if self.scene.model.nq == self.scene.model.nv:
-            return change
-        return np.asarray(_over_all(convert, self.scene, jnp.asarray(qpos), jnp.asarray(change, qpos.dtype)))
 
     def _judge(self, lengths: tuple[int, ...]) -> Callable:
         """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""
@@ -221,8 +180,8 @@ class Mover:
 
 
 @eqx.filter_jit
-def _over_all(convert: Callable, scene: Scene, qpos: Float[Array, "a b nq"], change: Float[Array, "a b _"]) -> Array:
-    return jax.vmap(jax.vmap(lambda q, v: convert(scene, q, v)))(qpos, change)
+def _coordinates(scene: Scene, qpos: Float[Array, "a b nq"], change: Float[Array, "a b nv"]) -> Array:
+    return jax.vmap(jax.vmap(lambda q, v: to_coordinates(scene, q, v)))(qpos, change)
 
 
 def moved(
@@ -236,14 +195,6 @@ def moved(
     for one, place in zip(found, np.broadcast_to(places, len(found)), strict=True):
         mujoco.mj_integratePos(model, one, positions, float(place))
     return found
-
-
-def change_of_poses(
-    model: mujoco.MjModel, qpos: Float[ArrayLike, "motions nq"], positions: Float[np.ndarray, " nv"]
-) -> Float[np.ndarray, "motions nq"]:
-    """Return the derivative of `moved` with respect to the place, at zero."""
-    below, above = (moved(model, qpos, positions, x) for x in (-_TINY, _TINY))
-    return (above - below) / (2 * _TINY)
 
 
 def contact_of(model: mjx.Model) -> dict[str, Array]:

@@ -1,7 +1,6 @@
 """Measurements of how far gradients can be trusted."""
 
 from mjxgrad.diagnostics.bias_variance import BiasVariance, Landscape, bias_variance
-from mjxgrad.diagnostics.horizon import Crossover, crossover
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
@@ -9,7 +8,6 @@ from mjxgrad.diagnostics.statistics import mean_interval
 
 __all__ = [
     "BiasVariance",
-    "Crossover",
     "Jumps",
     "Landscape",
     "SlopeComparison",
@@ -17,7 +15,6 @@ __all__ = [
     "bias_variance",
     "check_stability",
     "compare_to_slope",
-    "crossover",
     "jumps_along",
     "mean_interval",
     "phases",

@@ -15,7 +15,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -128,10 +128,9 @@ class BiasVariance(eqx.Module):
             their variance per rollout and their mean α. None for fewer than two batches, random starts, or an objective whose
             noise is unknown.
         cost: the cost without noise.
-        reference: the gradient of the smoothed cost, from separate rollouts.
+        reference: the gradient of the smoothed cost, from separate rollouts: by a landscape, or the mean of many by an
+            estimator that stays unbiased with wrong derivatives.
         reference_error: standard error of the reference.
-        reference_method: "landscape" (see `Landscape`), or the mean of many rollouts by an estimator that stays unbiased with
-            wrong derivatives: "control_variate", or "zeroth_order" for random starts and unknown noise.
         bias: first order less reference.
         bias_error: standard error of the bias, from both parts.
         first_interval: interval of the mean first-order estimate; the intervals below are named alike.
@@ -164,7 +163,6 @@ class BiasVariance(eqx.Module):
     zeroth_variance_interval: Float[np.ndarray, "2 softness points"]
     alpha_order_variance_interval: Float[np.ndarray, "2 softness points"] | None
     landscape: Landscape | None
-    reference_method: Literal["landscape", "control_variate", "zeroth_order"] = eqx.field(static=True)
     warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
 
@@ -368,7 +366,6 @@ def bias_variance(
         zeroth_variance_interval=variances[1],
         alpha_order_variance_interval=variances[2] if has_alpha else None,
         warnings=told,
-        reference_method="landscape" if is_line else "control_variate" if knows_noise else "zeroth_order",
         confidence=confidence,
     )
 

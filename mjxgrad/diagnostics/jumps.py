@@ -19,22 +19,14 @@ class Jumps(eqx.Module):
     """The jumps of a quantity along a path, in order; sizes are Euclidean norms over the outcome.
 
     Attributes:
-        parameters: parameters of the grid.
-        values: values on the grid.
         places: parameters at which the jumps are.
         before: the value just before each.
         after: the value just after each.
-        steepest: the largest change per parameter among divided intervals without a jump; zero if there are none.
-        scale: largest size of a value on the grid.
     """
 
-    parameters: Float[np.ndarray, " points"]
-    values: Float[np.ndarray, "points *outcome"]
     places: Float[np.ndarray, " jumps"]
     before: Float[np.ndarray, "jumps *outcome"]
     after: Float[np.ndarray, "jumps *outcome"]
-    steepest: float
-    scale: float
 
     @property
     def sizes(self) -> Float[np.ndarray, " jumps"]:
@@ -42,22 +34,9 @@ class Jumps(eqx.Module):
         return _norm(self.after - self.before)
 
     @property
-    def relative(self) -> Float[np.ndarray, " jumps"]:
-        """Sizes over the larger of the values before and after: 1 for a fall to zero, √2 for a turn by a right angle."""
-        larger = np.maximum(_norm(self.before), _norm(self.after))
-        return self.sizes / np.where(larger > 0, larger, 1.0)
-
-    @property
     def largest(self) -> int:
         """The index of the largest jump; −1 if there is none."""
         return int(np.argmax(self.sizes)) if len(self.places) else -1
-
-    @property
-    def share(self) -> float:
-        """The share of the quantity's total variation that is jumps; zero if it does not vary."""
-        steps = _norm(np.diff(self.values, axis=0))
-        total = float(steps[np.isfinite(steps)].sum())
-        return min(1.0, float(self.sizes.sum()) / total) if total > 0 else 0.0
 
 
 def jumps_along(
@@ -84,7 +63,7 @@ def jumps_along(
         smallest: smallest jump that counts, as a share of the largest value on the grid.
 
     Returns:
-        The jumps, and the grid.
+        The jumps.
 
     Raises:
         ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` and at least two,
@@ -103,20 +82,9 @@ def jumps_along(
     values = _evaluate(function, grid)
     ends, at_ends, changes, is_jump = _refine(function, grid, values, num_candidates, num_refinements)
     finite = np.isfinite(values).reshape(num_points, -1).all(axis=1)
-    scale = float(_norm(values[finite]).max(initial=0.0))
-    is_jump &= changes > smallest * scale
-    widths = ends[:, 1] - ends[:, 0]
-    slopes = np.where(is_jump | (changes < 0), 0.0, changes / np.where(widths > 0, widths, 1.0))
+    is_jump &= changes > smallest * _norm(values[finite]).max(initial=0.0)
     order = np.flatnonzero(is_jump)[np.argsort(ends[is_jump, 0])]
-    return Jumps(
-        parameters=grid,
-        values=values,
-        places=ends[order].mean(axis=1),
-        before=at_ends[order, 0],
-        after=at_ends[order, 1],
-        steepest=float(slopes.max(initial=0.0)),
-        scale=scale,
-    )
+    return Jumps(ends[order].mean(axis=1), at_ends[order, 0], at_ends[order, 1])
 
 
 def _refine(

@@ -32,7 +32,7 @@ _ROUNDINGS = 1e3  # rounding errors of the outcome that many steps may add up
 class SlopeComparison(eqx.Module):
     """Derivatives beside the slope, in units of the outcome over those of the parameter.
 
-    With fewer than 32 finite phases, numbers are NaN and judgements (`is_close`, `is_off`, `is_resolved`) are False.
+    With fewer than 32 finite phases, numbers are NaN and `is_resolved` is False.
 
     Attributes:
         gradients: names of the derivatives, in the order of their axis.
@@ -99,17 +99,6 @@ class SlopeComparison(eqx.Module):
         """Size of `error` beyond rounding, over `scale`."""
         size = np.abs(self.error)
         return np.where(size > self.resolution, size, 0 * size) / self.scale
-
-    def is_close(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
-        """Return whether each mean derivative equals the slope to within `tolerance` times `scale`."""
-        return self.relative_error <= tolerance
-
-    def is_off(self, tolerance: float = 0.05) -> Bool[np.ndarray, "gradients *outcome"]:
-        """Return whether each mean derivative is off by more than that, beyond two standard errors.
-
-        If it is neither close nor off, add rollouts.
-        """
-        return np.abs(self.error) - 2 * self.standard_error > np.maximum(tolerance * self.scale, self.resolution)
 
     def is_resolved(self, tolerance: float = 0.05) -> Bool[np.ndarray, "*outcome"]:
         """Return whether the slope is known well enough: its standard error is below `tolerance` times `scale`."""

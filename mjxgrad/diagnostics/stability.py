@@ -57,11 +57,11 @@ class Spring:
         given: time constant in the file, in s; None in the direct format.
         timestep: $h$, in s.
         integrator: integrator of the model.
-        size: largest travel in one step that is still detected: the thickness of the bodies, or the range of a limit, in m
-            (rad); infinite for planes and equalities.
+        size: largest travel in one step that is still detected: the thickness of the bodies, in m; infinite for planes,
+            limits and equalities.
         num_rows: largest number of contacts of the pair at once.
         pyramid: sliding friction μ of a pyramidal contact in single precision; None for all others.
-        speed: assumed speed of approach, in m/s (rad/s at limits of hinges); None for none.
+        speed: assumed speed of approach of a contact, in m/s; None for none.
     """
 
     kind: str
@@ -73,7 +73,7 @@ class Spring:
     given: float | None
     timestep: float
     integrator: mujoco.mjtIntegrator
-    size: float
+    size: float = math.inf
     num_rows: int = 1
     pyramid: float | None = None
     speed: float | None = None
@@ -129,7 +129,7 @@ class Spring:
         return float(self._bounce.duration) / self.timestep
 
     def depth(self, speed: float) -> float:
-        r"""Return the depth of a bounce at a speed of approach, $v \sqrt e / \omega_0$, restitution $e$ (m, or rad)."""
+        r"""Return the depth in m of a bounce at a speed of approach, $v \sqrt e / \omega_0$, restitution $e$."""
         if self.stiffness <= 0:
             return np.inf
         restitution = 1.0 if self.damping <= 0 else float(self._bounce.restitution)
@@ -139,12 +139,6 @@ class Spring:
         """Return the number of steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
         first, last = self.impedance
         return self.width / (speed * self.timestep) if first != last and speed > 0 else np.inf
-
-    @property
-    def _written(self) -> tuple[str, str]:
-        """The speed, and the depth beyond which a bounce passes through, as text; a limit has its joint's unit."""
-        is_length = self.kind == "contact"
-        return format_number(self.speed or 0.0) + " m/s" * is_length, f"{self.size:.3g}" + " m" * is_length
 
     @property
     def _bounce(self) -> Bounce:
@@ -161,19 +155,12 @@ class StabilityReport:
         springs: contact pairs, then joint limits, tendon limits and equalities.
         timestep: time step, in s.
         speed: assumed speed of approach, in m/s, or None.
-        joint_speed: assumed speed of joints and tendons, in rad/s or m/s, or None.
     """
 
     name: str
     springs: tuple[Spring, ...]
     timestep: float
     speed: float | None = None
-    joint_speed: float | None = None
-
-    @property
-    def is_stable(self) -> bool:
-        """Whether no spring gains energy, even where all contacts of a pair act at once."""
-        return all(spring.coupled_load < 1 for spring in self.springs)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -187,15 +174,11 @@ class StabilityReport:
 
     def summary(self) -> str:
         """Return a report for a terminal of 120 columns: one line per group of equal springs, then the warnings."""
-        speeds = "".join(
-            f", at {format_number(value)} {unit}"
-            for value, unit in ((self.speed, "m/s"), (self.joint_speed, "rad/s at limits"))
-            if value is not None
-        )
-        lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speeds}"]
+        speed = "" if self.speed is None else f", at {format_number(self.speed)} m/s"
+        lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speed}"]
         if not self.springs:
             return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
-        lines += _aligned([self._columns, *self._rows()])
+        lines += _aligned([_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()])
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)
         return "\n".join(
@@ -204,10 +187,6 @@ class StabilityReport:
 
     def __str__(self) -> str:
         return self.summary()
-
-    @property
-    def _columns(self) -> tuple[str, ...]:
-        return _COLUMNS + _SPEED_COLUMNS * (self.speed is not None or self.joint_speed is not None)
 
     def _rows(self) -> Iterator[tuple[str, ...]]:
         groups: dict[tuple[str, ...], list[Spring]] = {}
@@ -225,21 +204,20 @@ class StabilityReport:
             low if low == high else f"{low}–{high}",
             *map(format_number, (spring.load, spring.coupled_load, spring.num_steps)),
         )
-        if len(self._columns) == len(_COLUMNS):
+        if self.speed is None:
             return cells
         if spring.speed is None:
             return (*cells, "", "")
-        unit, scale = ("mm", 1e3) if spring.kind == "contact" else ("", 1.0)
-        depth = f"{format_number(scale * spring.depth(spring.speed))} {unit}".strip()
+        depth = f"{format_number(1e3 * spring.depth(spring.speed))} mm"
         return (*cells, depth, format_number(spring.rise_steps(spring.speed)))
 
 
 def _passed(spring: Spring) -> str | None:
     if spring.speed is None or spring.speed * spring.timestep < spring.size:
         return None
-    at, size = spring._written
     return (
-        f"at {at} the bodies move {spring.speed * spring.timestep:.3g} in one step, more than the {size} within "
+        f"at {spring.speed:.4g} m/s the bodies move {spring.speed * spring.timestep:.3g} m in one step, more than the "
+        f"{spring.size:.3g} m within "
         f"which they are found, and can pass through; use a time step below {spring.size / spring.speed:.2g} s"
     )
 
@@ -250,9 +228,8 @@ def _deep(spring: Spring) -> str | None:
         return None
     # At a fixed damping ratio the depth is proportional to stiffness^(-1/2).
     needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
-    at, size = spring._written
     return (
-        f"at {at} a bounce goes {spring.depth(speed):.3g} deep, more than the {size} from which bodies "
+        f"at {speed:.4g} m/s a bounce goes {spring.depth(speed):.3g} m deep, more than the {spring.size:.3g} m from which bodies "
         f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
     )
 
@@ -274,11 +251,10 @@ def _unresolved(spring: Spring) -> str | None:
     reasons += [f"rises within {steps:.2g} time steps"] * (steps < STEPS_NEEDED)
     if not reasons:
         return None
-    unit = " m" if spring.kind == "contact" else ""
     return (
-        f"at {spring._written[0]} its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
+        f"at {spring.speed:.4g} m/s its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
         "contact=mg.Slope(), as tasks do by default, or an impedance from 0 over a width of at least "
-        f"{STEPS_NEEDED * spring.speed * spring.timestep:.2g}{unit}"
+        f"{STEPS_NEEDED * spring.speed * spring.timestep:.2g} m"
     )
 
 
@@ -323,7 +299,7 @@ def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
     return ["  " + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
 
 
-def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: float | None = None) -> StabilityReport:
+def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityReport:
     """Check whether the time step of a scene resolves its contacts, limits and equalities.
 
     Nothing is simulated. The limits are those of a single spring and damper, see this module.
@@ -332,17 +308,15 @@ def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: fl
         scene: a scene with known values.
         speed: speed at which geoms approach each other, in m/s. Passing through, depth and onsets depend on it and are
             checked only where it is given.
-        joint_speed: speed of joints and tendons at their limits, in rad/s or m/s.
 
     Returns:
         The report: `print` it, or read its `warnings`.
 
     Raises:
-        ValueError: if a speed is not positive, or the scene is batched or traced.
+        ValueError: if the speed is not positive, or the scene is batched or traced.
     """
-    for name, value in (("speed", speed), ("joint_speed", joint_speed)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be positive, got {value}; leave it out to skip these checks")
+    if speed is not None and not (math.isfinite(speed) and speed > 0):
+        raise ValueError(f"speed must be positive, got {speed}; leave it out to skip these checks")
     model = scene.model
     leaves = (model.geom_solref, model.jnt_solref, model.opt.timestep)
     is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
@@ -350,8 +324,8 @@ def check_stability(scene: Scene, *, speed: float | None = None, joint_speed: fl
         raise ValueError("check_stability needs one scene with known values, got a batched or traced one")
     # Inside jit, even operations on known values would be traced.
     with jax.ensure_compile_time_eval():
-        springs = (*_contacts(scene, speed), *_others(scene, joint_speed))
-    return StabilityReport(scene.name, springs, float(model.opt.timestep), speed, joint_speed)
+        springs = (*_contacts(scene, speed), *_others(scene))
+    return StabilityReport(scene.name, springs, float(model.opt.timestep), speed)
 
 
 def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
@@ -378,30 +352,29 @@ def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
         )
 
 
-def _others(scene: Scene, speed: float | None) -> Iterator[Spring]:
+def _others(scene: Scene) -> Iterator[Spring]:
     """Return the active joint limits, tendon limits and equalities."""
     m, c, flag, of = scene.model, scene.mj_model, mujoco.mjtDisableBit, mujoco.mjtObj
     disabled = int(m.opt.disableflags)
     if disabled & flag.mjDSBL_CONSTRAINT:
         return
-    joints = (c.jnt_limited, m.jnt_solref, m.jnt_solimp, m.jnt_range)
-    tendons = (c.tendon_limited, m.tendon_solref_lim, m.tendon_solimp_lim, m.tendon_range)
+    joints = (c.jnt_limited, m.jnt_solref, m.jnt_solimp)
+    tendons = (c.tendon_limited, m.tendon_solref_lim, m.tendon_solimp_lim)
     kinds = (
         ("joint limit", flag.mjDSBL_LIMIT, of.mjOBJ_JOINT, *joints),
         ("tendon limit", flag.mjDSBL_LIMIT, of.mjOBJ_TENDON, *tendons),
-        ("equality", flag.mjDSBL_EQUALITY, of.mjOBJ_EQUALITY, c.eq_active0, m.eq_solref, m.eq_solimp, None),
+        ("equality", flag.mjDSBL_EQUALITY, of.mjOBJ_EQUALITY, c.eq_active0, m.eq_solref, m.eq_solimp),
     )
-    for kind, off, which, active, solref, solimp, ranges in kinds:
+    for kind, off, which, active, solref, solimp in kinds:
         chosen = np.flatnonzero(active)
         if disabled & off or not chosen.size:
             continue
         stiffness, damping = (np.asarray(x, float) for x in stiffness_damping(m, solref))
         for i in chosen:
             name = mujoco.mj_id2name(c, which, i) or f"{kind} {i}"
-            size = np.inf if ranges is None else float(np.ptp(np.asarray(ranges[i], float)))
             impedance = np.clip(np.asarray(solimp[i, :2], float), mujoco.mjMINIMP, mujoco.mjMAXIMP)
             springiness = (stiffness[i], damping[i], np.asarray(solref[i], float), impedance, solimp[i, 2])
-            yield _spring(scene, kind, name, *springiness, size=size, speed=None if kind == "equality" else speed)
+            yield _spring(scene, kind, name, *springiness)
 
 
 def _spring(

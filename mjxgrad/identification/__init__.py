@@ -1,6 +1,5 @@
 """Parameters of a scene from recorded motions, through contact."""
 
-from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
     Parameter,
     armature,
@@ -28,7 +27,6 @@ __all__ = [
     "gains",
     "gear",
     "identify",
-    "inertia",
     "mass",
     "softness",
 ]

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
     Parameter,
     armature,
@@ -33,8 +32,7 @@ from mjxgrad.scene.scene import numbers_of
 _Object = mujoco.mjtObj
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
 _NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
-_ALONE = {"inertia": inertia, "gains": gains}
-KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
+KINDS = ("mass", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
@@ -75,9 +73,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
     if kind in _NAMED:
         return _NAMED[kind](scene, *names, bounds=bounds)
-    if len(names) > 1 or (bounds is not None and kind == "inertia"):
-        raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
-    return _ALONE[kind](scene, *names, **({} if bounds is None else {"bounds": bounds}))
+    if len(names) > 1:
+        raise ValueError(f"gains takes one name, got {text!r}")
+    return gains(scene, *names, bounds=bounds)
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
@@ -195,6 +193,12 @@ def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]
     return whole
 
 
+def column_names(scene: Scene) -> dict[tuple[str, int], str]:
+    """Return the column name for each number of a signal, by signal and index."""
+    places = sorted(_places(scene.mj_model).items(), key=lambda item: ":" in item[0])
+    return {(signal, index): name for name, [(_, signal, index, _), *_] in places}
+
+
 def _first(scene: Scene, found: Mapping[str, np.ndarray]) -> Any:
     """Return the state of the first row; missing parts are the scene's pose, at rest."""
     given = {}
@@ -233,13 +237,8 @@ def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tup
     if share == 0:
         return list(recordings), []
     if len(recordings) > 1:
-        count = min(max(1, round(share * len(recordings))), len(recordings) - 1)
-        chosen = set(np.linspace(0, len(recordings) - 1, count + 2).round().astype(int)[1:-1].tolist())
-        chosen = chosen or {len(recordings) - 1}
-        groups = ([], [])
-        for i, one in enumerate(recordings):
-            groups[i in chosen].append(one)
-        return groups
+        every = min(max(2, round(1 / share)), len(recordings))
+        return [one for i, one in enumerate(recordings, 1) if i % every], list(recordings[every - 1 :: every])
     (whole,) = recordings
     times = np.asarray(whole.times, float)
     is_late = times > (1 - share) * times[-1]

@@ -1,216 +1,99 @@
-"""Report of an identification as HTML page and JSON: the answer, signals, values, and the motion before and after."""
+"""Report of an identification as a page: the answer, signals before and after, and values."""
 
-import functools
-import json
-import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
-from jaxtyping import ArrayLike
 
-from mjxgrad.identification import Identification, Recording, Stopped
-from mjxgrad.identification.recording import simulated, stack
+from mjxgrad.identification.files import column_names
+from mjxgrad.identification.recording import Recording, simulated, stack
+from mjxgrad.identification.result import Identification
 from mjxgrad.report import INK, Block, Table, page, svg
-from mjxgrad.rollouts import render
 from mjxgrad.scene import Scene
 
 _MOST_SIGNALS, _MOST_DOTS = 8, 300
-_FRAME = (240, 320)
 _SIZE = (4.6, 2.1)  # inches
 
 
-@dataclass(frozen=True)
-class Identified:
-    """A result beside its recordings.
+def identified_page(
+    name: str, scene: Scene, result: Identification, recordings: Sequence[Recording], held_out: Sequence[Recording]
+) -> str:
+    """Return a self-contained page; needs `mjxgrad[render]`.
 
-    Attributes:
+    Args:
         name: name of the scene.
         scene: the scene with the nominal values.
         result: the result of the search.
         recordings: the fitted recordings.
         held_out: the held-out recordings.
-        seconds: duration of the search.
     """
-
-    name: str
-    scene: Scene
-    result: Identification
-    recordings: Sequence[Recording]
-    held_out: Sequence[Recording]
-    seconds: float
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether the search converged and determined every number."""
-        result = self.result
-        return result.stopped is Stopped.CONVERGED and not (
-            result.without_effect or result.inseparable or result.at_bounds
-        )
-
-    @property
-    def headline(self) -> str:
-        """The answer, in at most 15 words."""
-        result = self.result
-        lost = int(np.isinf(np.concatenate([np.ravel(half) for half in result.half_width.values()])).sum())
-        if result.stopped is not Stopped.CONVERGED:
-            ended = "stalled" if result.stopped is Stopped.STALLED else "was cut short"
-            return f"The search {ended}: do not trust the values."
-        count = len(result.names)
-        found = f"{count - lost} of {count} numbers found" if lost else f"All {count} found" if count > 1 else "Found"
-        if result.at_bounds and not lost:
-            found = f"{len(result.at_bounds)} of {count} numbers ended at a bound"
-        rms, which = (result.rms, "error") if result.held_out_rms is None else (result.held_out_rms, "held-out error")
-        return f"{found}: {which} {_percent(rms[1])} of the motion, {_percent(rms[0])} before."
-
-    def as_json(self) -> str:
-        """Return the result as JSON; numbers in SI units, null where undetermined."""
-        result = self.result
-        lower, upper = (
-            result.coordinates.unravel(np.asarray(x)) for x in (result.coordinates.lower, result.coordinates.upper)
-        )
-        parts = {"value": result.values, "half_width_95": result.half_width, "start": result.start}
-        parts |= {"lower": lower, "upper": upper}
-        table = {
-            "scene": self.name,
-            "headline": self.headline,
-            "parameters": {
-                name: {key: _plain(part[name]) for key, part in parts.items()} | {"unit": result.units.get(name, "")}
-                for name in result.values
-            },
-            "condition_number": _plain(result.condition_number),
-            "without_effect": result.without_effect,
-            "inseparable": result.inseparable,
-            "at_bounds": result.at_bounds,
-            "rms": result.rms,
-            "held_out_rms": result.held_out_rms,
-            "stopped": result.stopped.value,
-            "num_steps": result.num_steps,
-            "seconds": self.seconds,
-        }
-        return json.dumps(table, indent=2, ensure_ascii=False)
-
-    def as_html(self) -> str:
-        """Return the result as a self-contained page; needs `mjxgrad[render]`."""
-        number, (head, *rows) = f"{self.result.condition_number:.2g}", self.result.rows()
-        condition = (
-            f"Condition number {number}: beyond 100 or so, single intervals are much wider than those of combinations."
-        )
-        faults = [text.strip() for text in self.result.warnings()]
-        numbers = Block(faults=faults, items=[condition], table=Table(head, rows))
-        blocks = [self._video(), self._figures(), numbers, Block(folded="In words", code=self.result.summary())]
-        return page(self.headline, f"mjxgrad identify {self.name}", blocks)
-
-    @property
-    def _shown(self) -> Recording:
-        """The motion to show: the held-out end of a single recording, else the first recording."""
-        return (self.held_out if len(self.recordings) == 1 and self.held_out else self.recordings)[0]
-
-    @functools.cached_property
-    def _courses(self) -> tuple[dict[str, np.ndarray], ...]:
-        window, found = jax.tree.map(lambda leaf: leaf[0], stack(self.scene, [self._shown])), self.result
-        run = jax.jit(lambda scene, delay: simulated(scene, window, None, delay)[0])
-        courses = [run(s, v.get("delay", 0.0)) for s, v in ((self.scene, found.start), (found.scene, found.values))]
-        return tuple(jax.tree.map(np.asarray, course) for course in courses)
-
-    def _measured(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return times and values of a signal, from the first fitted motion and the shown one."""
-        motions = list({id(one): one for one in (self.recordings[0], self._shown)}.values())
-        return np.concatenate([m.times for m in motions]), np.concatenate([m.measured[name] for m in motions])
-
-    def _figures(self) -> Block:
-        """Draw the signals, sorted by how much the search changed them."""
-        before, after = self._courses
-        signals = []
-        for name in self._shown.measured:
-            times, rows = self._measured(name)
-            titles = _titles(self.scene, name, rows.shape[1])
-            for title, values, old, new in zip(titles, rows.T, before[name].T, after[name].T, strict=True):
-                if (known := np.isfinite(values)).any():
-                    change = np.abs(new - old).max() / max(np.ptp(values[known]), 1e-12)
-                    signals.append((change, title, times[known], values[known], old, new))
-        signals.sort(key=lambda one: -one[0])
-        drawings = [
-            svg(lambda one=one: self._panel(*one[1:]), f"{one[1]} over time") for one in signals[:_MOST_SIGNALS]
-        ]
-        caption = "Dots: measured. Dashed: at the start of the search. Line: with the values found. Grey: held out."
-        if len(signals) > len(drawings):
-            caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
-        return Block(drawings=drawings, caption=caption)
-
-    def _panel(self, title: str, times: np.ndarray, values: np.ndarray, before: np.ndarray, after: np.ndarray) -> Any:
-        """Draw a signal over time: measured, at the start, identified; the curve at the start may leave the picture."""
-        import matplotlib.pyplot as plt
-
-        figure, axis = plt.subplots(figsize=_SIZE)
-        at = float(self.scene.model.opt.timestep) * np.arange(len(before))
-        end = max(at[-1], times.max())
-        if self._shown is not self.recordings[0]:
-            axis.axvspan(float(self.recordings[0].times[-1]), end, color="#8b94a1", alpha=0.2, lw=0)
-        shown = slice(None, None, max(1, len(times) // _MOST_DOTS))
-        axis.plot(times[shown], values[shown], "o", color=INK, ms=2.5, mew=0, alpha=0.6)
-        axis.plot(at, before, "--", color="#d55e00", lw=1.2)
-        axis.plot(at, after, "-", color="#0072b2", lw=1.4)
-        low, high = (float(pick([pick(values), pick(after)])) for pick in (np.min, np.max))
-        room = 0.15 * (high - low) or max(abs(low), 1e-9)
-        axis.set_title(title, parse_math=False)  # names may contain dollars
-        axis.set(xlabel="time, s", xlim=(0, end), ylim=(low - room, high + room))
-        return figure
-
-    def _video(self) -> Block:
-        """Film the motion before and after, side by side, overlaid with the measured motion where it is complete."""
-        before, after = (course["qpos"] for course in self._courses)
-        film = functools.partial(render.frames, height=_FRAME[0], width=_FRAME[1])
-        at = float(self.scene.model.opt.timestep) * np.arange(len(before))
-        words = "Left: at the start of the search. Right: with the values found."
-        try:
-            shots = [film(self.scene, before), film(self.result.scene, after)]
-            if "qpos" in self._shown.measured:
-                times, rows = self._measured("qpos")
-                known = np.flatnonzero(np.isfinite(rows).all(axis=1))
-                known = known[np.argsort(times[known])]
-                if len(known) > 1 and times[known[-1]] >= (at[-1] + at[-2]) / 2:
-                    real = film(self.scene, rows[known][np.abs(times[known] - at[:, None]).argmin(axis=1)])
-                    shots = [((shot.astype(np.uint16) + real) // 2).astype(np.uint8) for shot in shots]
-                    words += " Both with what was measured drawn into them."
-            with tempfile.TemporaryDirectory() as folder:
-                render.write_video(path := Path(folder) / "motion.mp4", np.concatenate(shots, axis=2))
-                return Block(video=path.read_bytes(), caption=words)
-        except (RuntimeError, ValueError) as error:
-            return Block(text=f"No video: {error}")
+    condition = (
+        f"Condition number {result.condition_number:.2g}: beyond 100 or so, single intervals are much wider than those of "
+        "combinations."
+    )
+    head, *rows = result.rows()
+    numbers = Block(faults=result.warnings(), items=[condition], table=Table(head, rows))
+    # The held-out end of a single recording, else the first recording.
+    motions = [recordings[0], *(held_out[:1] if len(recordings) == 1 else ())]
+    blocks = [_figures(scene, result, motions), numbers, Block(folded="In words", code=result.summary())]
+    return page(result.headline, f"mjxgrad identify {name}", blocks)
 
 
-def _titles(scene: Scene, name: str, width: int) -> list[str]:
-    """Return titles for the numbers of a signal: joints with units for positions and velocities, else indices."""
-    if name not in ("qpos", "qvel"):
-        return [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
-    model, found = scene.mj_model, []
-    for joint in range(model.njnt):
-        label = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
-        # A free joint often has no name, but its body has one.
-        label = label or mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, model.jnt_bodyid[joint]) or f"joint {joint}"
-        kind, rate = mujoco.mjtJoint(model.jnt_type[joint]), "/s" * (name == "qvel")
-        turns = [f"rotation {axis}, rad/s" for axis in "xyz"] if rate else [f"quaternion {part}" for part in "wxyz"]
-        parts = {
-            mujoco.mjtJoint.mjJNT_FREE: [*(f"{axis}, m{rate}" for axis in "xyz"), *turns],
-            mujoco.mjtJoint.mjJNT_BALL: turns,
-            mujoco.mjtJoint.mjJNT_SLIDE: [f"m{rate}"],
-            mujoco.mjtJoint.mjJNT_HINGE: [f"rad{rate}"],
-        }[kind]
-        found += [f"{label}, {part}" if len(parts) == 1 else f"{label} {part}" for part in parts]
-    return found
+def _figures(scene: Scene, result: Identification, motions: Sequence[Recording]) -> Block:
+    """Draw the signals of the last motion, sorted by how much the search changed them."""
+    window = jax.tree.map(lambda leaf: leaf[0], stack(scene, motions[-1:]))
+    run = jax.jit(lambda scene, delay: simulated(scene, window, None, delay)[0])
+    courses = [run(s, v.get("delay", 0.0)) for s, v in ((scene, result.start), (result.scene, result.values))]
+    before, after = jax.tree.map(np.asarray, courses)
+    times = np.concatenate([motion.times for motion in motions])
+    fitted_until = float(motions[0].times[-1]) if len(motions) > 1 else None
+    names, signals = column_names(scene), []
+    for name in motions[-1].measured:
+        rows = np.concatenate([motion.measured[name] for motion in motions])
+        for i, values in enumerate(rows.T):
+            known = np.isfinite(values)
+            if known.any():
+                old, new = before[name][:, i], after[name][:, i]
+                change = np.abs(new - old).max() / max(np.ptp(values[known]), 1e-12)
+                signals.append((change, names.get((name, i), name), times[known], values[known], old, new))
+    signals.sort(key=lambda one: -one[0])
+    timestep = float(scene.model.opt.timestep)
+    drawings = [
+        svg(lambda one=one: _panel(*one[1:], timestep=timestep, fitted_until=fitted_until), f"{one[1]} over time")
+        for one in signals[:_MOST_SIGNALS]
+    ]
+    caption = (
+        "SI units. Dots: measured. Dashed: at the start of the search. Line: with the values found. Grey: held out."
+    )
+    if len(signals) > len(drawings):
+        caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
+    return Block(drawings=drawings, caption=caption)
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
+def _panel(
+    title: str,
+    times: np.ndarray,
+    values: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    timestep: float,
+    fitted_until: float | None,
+) -> Any:
+    """Draw a signal over time: measured, at the start, identified; the curve at the start may leave the picture."""
+    import matplotlib.pyplot as plt
 
-
-def _plain(value: ArrayLike) -> float | list | None:
-    """Return numbers for JSON; null where not finite."""
-    if np.ndim(value):
-        return [_plain(one) for one in np.asarray(value)]
-    return float(value) if np.isfinite(value) else None  # pyright: ignore[reportArgumentType]
+    figure, axis = plt.subplots(figsize=_SIZE)
+    at = timestep * np.arange(len(before))
+    end = max(at[-1], times.max())
+    if fitted_until is not None:
+        axis.axvspan(fitted_until, end, color="#8b94a1", alpha=0.2, lw=0)
+    shown = slice(None, None, max(1, len(times) // _MOST_DOTS))
+    axis.plot(times[shown], values[shown], "o", color=INK, ms=2.5, mew=0, alpha=0.6)
+    axis.plot(at, before, "--", color="#d55e00", lw=1.2)
+    axis.plot(at, after, "-", color="#0072b2", lw=1.4)
+    low, high = (float(pick([pick(values), pick(after)])) for pick in (np.min, np.max))
+    room = 0.15 * (high - low) or max(abs(low), 1e-9)
+    axis.set_title(title, parse_math=False)  # names may contain dollars
+    axis.set(xlabel="time, s", xlim=(0, end), ylim=(low - room, high + room))
+    return figure

@@ -63,7 +63,7 @@ class Coordinates(eqx.Module):
         nominal: the nominal values.
         lower: the lower bounds.
         upper: the upper bounds.
-        names: one name per number, `mass` or `inertia[3]`.
+        names: one name per number, `mass` or `gains[1]`.
         shapes: name and shape of each parameter.
     """
 
@@ -116,10 +116,9 @@ class Coordinates(eqx.Module):
         """Return the bounds in search coordinates."""
         return (self.lower - self.nominal) / self.scale, (self.upper - self.nominal) / self.scale
 
-    def is_at_bound(self, values: Float[Array, " dim"]) -> tuple[Bool[Array, " dim"], Bool[Array, " dim"]]:
-        """Return masks of the numbers at their lower and at their upper bound, up to rounding."""
-        near = _AT_BOUND * self.scale
-        return values - self.lower < near, self.upper - values < near
+    def is_at_bound(self, values: Float[Array, " dim"]) -> Bool[Array, " dim"]:
+        """Return whether each number is at a bound, up to rounding."""
+        return jnp.minimum(values - self.lower, self.upper - values) < _AT_BOUND * self.scale
 
 
 def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping[str, Array]) -> Scene:

@@ -63,7 +63,7 @@ class Identification:
         start: the nominal values, by name.
         half_width: half-widths of the 95 % intervals, by name; infinite where the recordings determine nothing.
         covariance: covariance of all numbers in the order of `names`; infinite on the diagonal where they are not determined.
-        names: one name per number, `inertia[3]` within an array.
+        names: one name per number, `gains[1]` within an array.
         condition_number: condition number of J with columns of length 1. Beyond a hundred or so, single intervals are much
             wider than those of combinations.
         without_effect: names on which no measurement depends.
@@ -72,14 +72,14 @@ class Identification:
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         has_noise: whether the recordings state the noise of every signal.
         held_out_rms: the same for the held-out recordings; None without any.
-        offsets: changes of the starts, one array (windows, 2 nv) for each scene; None unless asked for.
+        offsets: changes of the starts; None unless asked for.
         correlation: correlation of successive residuals of a signal. About 0 if only independent noise is left.
         removable: share of the sum of squares that the linear model at the end could still remove within the bounds. About 0
             at a minimum of a smooth motion.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
         stopped: the reason why the search ended.
-        scenes: the scenes with the identified values.
+        scene: the scene with the identified values.
         coordinates: bounds and names, for saving.
         units: units by name.
     """
@@ -96,20 +96,35 @@ class Identification:
     rms: tuple[float, float]
     has_noise: bool
     held_out_rms: tuple[float, float] | None
-    offsets: tuple[np.ndarray, ...] | None
+    offsets: Float[np.ndarray, "windows _"] | None
     correlation: float
     removable: float
     num_numbers: int
     num_steps: int
     stopped: Stopped
-    scenes: tuple[Scene, ...]
+    scene: Scene
     coordinates: Coordinates
     units: dict[str, str]
 
     @property
-    def scene(self) -> Scene:
-        """The first, or only, scene with the identified values."""
-        return self.scenes[0]
+    def is_sound(self) -> bool:
+        """Whether the search converged and determined every number."""
+        return self.stopped is Stopped.CONVERGED and not (self.without_effect or self.inseparable or self.at_bounds)
+
+    @property
+    def headline(self) -> str:
+        """The answer, in at most 15 words."""
+        lost = int(np.isinf(np.concatenate([np.ravel(half) for half in self.half_width.values()])).sum())
+        if self.stopped is not Stopped.CONVERGED:
+            ended = "stalled" if self.stopped is Stopped.STALLED else "was cut short"
+            return f"The search {ended}: do not trust the values."
+        count = len(self.names)
+        found = f"{count - lost} of {count} numbers found" if lost else f"All {count} found" if count > 1 else "Found"
+        if self.at_bounds and not lost:
+            found = f"{len(self.at_bounds)} of {count} numbers ended at a bound"
+        rms, which = (self.rms, "error") if self.held_out_rms is None else (self.held_out_rms, "held-out error")
+        before, after = (f"{100 * one:.2g} %" if one < 0.995 else f"{100 * one:.0f} %" for one in rms)
+        return f"{found}: {which} {after} of the motion, {before} before."
 
     def summary(self) -> str:
         """Describe the result in text: the values with their intervals, then the warnings."""

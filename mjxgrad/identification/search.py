@@ -43,11 +43,11 @@ _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
 
 
 def identify(
-    scene: Scene | Sequence[Scene],
+    scene: Scene,
     parameters: Mapping[str, Parameter],
-    recordings: Sequence[Any],
+    recordings: Sequence[Recording],
     *,
-    held_out: Sequence[Any] = (),
+    held_out: Sequence[Recording] = (),
     delay: str | None = None,
     free_start: bool = False,
     contact: Contact = Discrete(),
@@ -62,11 +62,11 @@ def identify(
     (`pip install 'mjxgrad[identify]'`).
 
     Args:
-        scene: the scene with nominal values; or several scenes that share the parameters.
-        parameters: parameters by name, from `mass`, `inertia`, `friction`, `softness` and the like, or a `Parameter` with its
+        scene: the scene with nominal values.
+        parameters: parameters by name, from `mass`, `friction`, `softness` and the like, or a `Parameter` with its
             own `write`.
-        recordings: recordings of the scene; for several scenes, a sequence for each of them.
-        held_out: recordings for validation only, in the same form.
+        recordings: recordings of the scene.
+        held_out: recordings for validation only.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
         contact: as in `rollout`. The default is MuJoCo's motion, which recordings by MuJoCo need: the intervals do not cover
@@ -82,13 +82,8 @@ def identify(
         DivergedError: if the simulation diverges with the nominal values.
         ImportError: if optimistix is not installed.
     """
-    scenes = [scene] if isinstance(scene, Scene) else list(scene)
-    groups = [recordings] if isinstance(scene, Scene) else list(recordings)
-    others = ([held_out] if isinstance(scene, Scene) else list(held_out)) or [()] * len(scenes)
-    if not len(scenes) == len(groups) == len(others) or not all(groups):
-        raise ValueError(
-            f"recordings must hold at least one for each of {len(scenes)} scenes, got {[len(g) for g in groups]}"
-        )
+    if not recordings:
+        raise ValueError("recordings must hold at least one, got none")
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     if max_steps < 1:
@@ -97,17 +92,16 @@ def identify(
         importlib.import_module("optimistix")
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
-    settings = {"delay": delay, "free_start": free_start, "contact": contact}
-    program = _Program(scenes, groups, parameters, **settings)
+    program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
     start = program.start()
     end = _descend(program, start, max_steps, log)
-    has_noise = all(set(one.noise) == set(one.measured) for group in groups for one in group)
+    has_noise = all(set(one.noise) == set(one.measured) for one in recordings)
     if has_noise and not free_start and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
         begin = program.searched()
         again = None if begin is None else _descend(program, begin, max_steps, log)
         if again is not None and _rms(program, again.found) < _rms(program, end.found):
             end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
-    return _identified(program, end, others, has_noise)
+    return _identified(program, end, held_out, has_noise)
 
 
 class _End(NamedTuple):
@@ -123,28 +117,26 @@ class _End(NamedTuple):
     """
 
     point: Array
-    found: list[tuple[Array, ...]]
+    found: tuple[Array, ...]
     num_steps: int
     has_ended: bool
     first: float
     removable: float
 
 
-def _identified(
-    program: "_Program", end: _End, held_out: Sequence[Sequence[Recording]], has_noise: bool
-) -> Identification:
+def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], has_noise: bool) -> Identification:
     """Return the values at the end of a search, with all that the recordings tell of them."""
     coordinates, numbers = program.coordinates, program.num_numbers
     values = np.asarray(coordinates.values(end.point[: len(coordinates.names)]), float)
     explained = on_host(end.found)
-    residual, slope, num_offsets = _without_offsets(explained)
+    residual, slope, num_offsets = _without_offsets(*explained)
     verdict: dict[str, Any] = vars(statistics(coordinates, values, residual, slope, numbers, num_offsets)).copy()
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     after, before = np.linalg.norm(residual), end.first * np.sqrt(numbers)
     rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
     stalls = end.removable > _STALLED and after > max(rounding, 1e-6) * before
     nominal = np.asarray(coordinates.nominal, float)
-    is_at_bound = np.logical_or(*coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype)))
+    is_at_bound = coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype))
     return Identification(
         **verdict,
         values=coordinates.unravel(values),
@@ -154,13 +146,13 @@ def _identified(
         rms=(end.first, float(after / np.sqrt(numbers))),
         has_noise=has_noise,
         held_out_rms=program.held_out_rms(held_out, nominal, values),
-        offsets=tuple(np.asarray(x) for x in program.offsets(end.point)) if program.free_start else None,
-        correlation=_correlation(program.windows, explained),
+        offsets=np.asarray(program.offsets(end.point)) if program.free_start else None,
+        correlation=_correlation(program.windows, explained[0]),
         removable=end.removable,
         num_numbers=numbers,
         num_steps=end.num_steps,
         stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if end.has_ended else Stopped.STEPS,
-        scenes=program.scenes(values),
+        scene=program.put(program.nominal, jnp.asarray(values, coordinates.nominal.dtype)),
         coordinates=coordinates,
         units={name: parameter.unit for name, parameter in program.parameters.items()},
     )
@@ -171,17 +163,17 @@ class _Program:
 
     def __init__(
         self,
-        scenes: Sequence[Scene],
-        recordings: Sequence[Sequence[Recording]],
+        scene: Scene,
+        recordings: Sequence[Recording],
         parameters: Mapping[str, Parameter],
         *,
         free_start: bool,
         delay: str | None,
-        **settings: Any,
+        contact: Contact,
     ):
-        self.nominal, self.parameters, self.coordinates = scenes, parameters, Coordinates.of(parameters)
-        self.free_start, self._delay, self._settings = free_start, delay, settings
-        self.windows = [stack(*one) for one in zip(scenes, recordings, strict=True)]
+        self.nominal, self.parameters, self.coordinates = scene, parameters, Coordinates.of(parameters)
+        self.free_start, self._delay, self._contact = free_start, delay, contact
+        self.windows = stack(scene, recordings)
         self.num_numbers = _num_numbers(self.windows)
         if not self.num_numbers:
             raise ValueError("recordings must hold something that was measured, got NaN alone")
@@ -192,58 +184,49 @@ class _Program:
             self._compiled[function] = compile_once(jax.jit(function).lower(*arguments))
         return self._compiled[function](*arguments)
 
-    def _put(self, scene: Scene, vector: Array) -> Scene:
+    def put(self, scene: Scene, vector: Array) -> Scene:
+        """Return the scene with these values."""
         return write_all(scene, self.parameters, self.coordinates.unravel(vector))
 
-    def _residuals(self, scene: Scene, vector: Array, offset: Array | None, window: Windows) -> Array:
-        scene = self._put(scene, vector)
+    def _residuals(self, vector: Array, offset: Array | None, window: Windows) -> Array:
+        scene = self.put(self.nominal, vector)
         delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
-        residual, diverged = residuals(scene, window, offset, delay, **self._settings)
+        residual, diverged = residuals(scene, window, offset, delay, contact=self._contact)
         return jnp.where(diverged, jnp.inf, residual)
 
-    def _traced(self, of_all: list[Windows], vector: Array, offsets: list[Array]) -> list[tuple[Array, ...]]:
-        found = []
-        for i, scene in enumerate(self.nominal):
+    def _traced(self, windows: Windows, vector: Array, offsets: Array | None) -> tuple[Array, ...]:
+        def one(window: Windows, offset: Array | None) -> tuple[Array, ...]:
+            def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
+                residual = self._residuals(vector, offset, window)
+                return residual, residual
 
-            def one(window: Windows, offset: Array | None, scene=scene):
-                def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
-                    residual = self._residuals(scene, vector, offset, window)
-                    return residual, residual
+            slopes, residual = jax.jacfwd(both, (0, 1) if self.free_start else (0,), has_aux=True)(vector, offset)
+            return residual, *slopes
 
-                argnums = (0, 1) if self.free_start else (0,)
-                slopes, residual = jax.jacfwd(both, argnums, has_aux=True)(vector, offset)
-                return residual, *slopes
+        return jax.vmap(one)(windows, offsets)
 
-            found.append(jax.vmap(one)(of_all[i], offsets[i] if self.free_start else None))
-        return found
-
-    def _sums(self, of_all: list[Windows | None], vectors: Array) -> Float[Array, "points rows"]:
+    def _sums(self, windows: Windows, vectors: Array) -> Float[Array, "points rows"]:
         """Return for each vector the sum of squares over all windows, cumulative over their rows."""
-        there = [(s, w) for s, w in zip(self.nominal, of_all, strict=True) if w is not None]
-        num_rows = max(windows.index.shape[1] for _, windows in there)
+        ends = np.cumsum([math.prod(weight.shape[1:]) for weight in windows.weight.values()])[:-1]
 
-        def of_window(scene: Scene, vector: Array, window: Windows) -> Array:
-            squares = self._residuals(scene, vector, None, window) ** 2
-            ends = np.cumsum([weight.size for weight in window.weight.values()])[:-1]
+        def of_window(vector: Array, window: Windows) -> Array:
+            squares = self._residuals(vector, None, window) ** 2
             of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
-            return jnp.pad(sum(of_rows), (0, num_rows - len(window.index)))
+            return jnp.stack(of_rows).sum(axis=0)
 
         def of_one(vector: Array) -> Array:
-            parts = [jax.vmap(functools.partial(of_window, s, vector))(w).sum(axis=0) for s, w in there]
-            return jnp.cumsum(sum(parts))
+            return jnp.cumsum(jax.vmap(functools.partial(of_window, vector))(windows).sum(axis=0))
 
         return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
 
-    def __call__(self, point: Array) -> list[tuple[Array, ...]]:
+    def __call__(self, point: Array) -> tuple[Array, ...]:
         vector = self.coordinates.values(point[: len(self.coordinates.names)])
         return self._run(self._traced, self.windows, vector, self.offsets(point))
 
     def start(self) -> Array:
         """Return the point of the nominal values, without offsets: zero."""
-        sizes = [len(w.controls) * 2 * s.model.nv for w, s in zip(self.windows, self.nominal, strict=True)]
-        return jnp.zeros(
-            len(self.coordinates.names) + (sum(sizes) if self.free_start else 0), self.coordinates.nominal.dtype
-        )
+        num_offsets = len(self.windows.controls) * 2 * self.nominal.model.nv if self.free_start else 0
+        return jnp.zeros(len(self.coordinates.names) + num_offsets, self.coordinates.nominal.dtype)
 
     def box(self) -> tuple[Array, Array]:
         """Return the bounds of a point; offsets are unbounded."""
@@ -254,10 +237,7 @@ class _Program:
     def searched(self) -> Array | None:
         """Return the best of many points between the bounds, by `particles`; None if none explains the recordings."""
         dtype = self.coordinates.nominal.dtype
-        weights = [np.asarray(w) > 0 for one in self.windows for w in one.weight.values()]
-        counts = np.zeros(max(there.shape[1] for there in weights))
-        for there in weights:
-            counts[: there.shape[1]] += there.sum(axis=(0, 2))
+        counts = sum((np.asarray(weight) > 0).sum(axis=(0, 2)) for weight in self.windows.weight.values())
         low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
 
         def sums_at(points: np.ndarray) -> np.ndarray:
@@ -265,40 +245,31 @@ class _Program:
             found = np.asarray(self._run(self._sums, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
-        best = best_point(sums_at, low, high, np.cumsum(counts), _NUM_POINTS)
+        best = best_point(sums_at, low, high, np.cumsum(counts).astype(float), _NUM_POINTS)
         return None if best is None else jnp.asarray(best, dtype)
 
-    def offsets(self, point: Array) -> list[Array]:
-        """Return the offsets of the starts in a point, one array per scene."""
-        found, first = [], len(self.coordinates.names)
-        for windows, scene in zip(self.windows, self.nominal, strict=True) if self.free_start else ():
-            shape = (len(windows.controls), 2 * scene.model.nv)
-            found.append(point[first : first + shape[0] * shape[1]].reshape(shape))
-            first += shape[0] * shape[1]
-        return found
-
-    def scenes(self, values: np.ndarray) -> tuple[Scene, ...]:
-        """Return the scenes with these values."""
-        vector = jnp.asarray(values, self.coordinates.nominal.dtype)
-        return tuple(self._put(scene, vector) for scene in self.nominal)
-
-    def held_out_rms(self, held_out: Sequence[Sequence[Recording]], *points: np.ndarray) -> tuple[float, float] | None:
-        """Return the rms residuals of held-out recordings at each of two points; None without any."""
-        judged = [stack(scene, one) if one else None for scene, one in zip(self.nominal, held_out, strict=True)]
-        if not any(judged):
+    def offsets(self, point: Array) -> Array | None:
+        """Return the offsets of the starts in a point, one row per window; None if starts are known."""
+        if not self.free_start:
             return None
-        vectors = jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
+        return point[len(self.coordinates.names) :].reshape(len(self.windows.controls), -1)
+
+    def held_out_rms(self, held_out: Sequence[Recording], *points: np.ndarray) -> tuple[float, float] | None:
+        """Return the rms residuals of held-out recordings at each of two points; None without any."""
+        if not held_out:
+            return None
+        judged, vectors = stack(self.nominal, held_out), jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
         sums = compile_once(jax.jit(self._sums).lower(judged, vectors))(judged, vectors)[:, -1]
-        first, last = np.sqrt(np.asarray(sums, float) / _num_numbers([one for one in judged if one is not None]))
+        first, last = np.sqrt(np.asarray(sums, float) / _num_numbers(judged))
         return float(first), float(last)
 
 
-def _rms(program: _Program, found: list[tuple[Array, ...]]) -> float:
-    return math.sqrt(sum(float(jnp.sum(one[0] ** 2)) for one in found) / program.num_numbers)
+def _rms(program: _Program, found: tuple[Array, ...]) -> float:
+    return math.sqrt(float(jnp.sum(found[0] ** 2)) / program.num_numbers)
 
 
-def _num_numbers(windows: Sequence[Windows]) -> int:
-    return sum(int((np.asarray(w) > 0).sum()) for one in windows for w in one.weight.values())
+def _num_numbers(windows: Windows) -> int:
+    return sum(int((np.asarray(weight) > 0).sum()) for weight in windows.weight.values())
 
 
 def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -> _End:
@@ -377,45 +348,39 @@ def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
     )
 
 
-def _linear_model(
-    program: _Program, found: list[tuple[Array, ...]], point: Array, size: float
-) -> tuple[Array, Array, Array]:
+def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, size: float) -> tuple[Array, Array, Array]:
     """Return a point, its residuals in units of the first ones, and their derivative by the point."""
     count = len(program.coordinates.names)
-    residual = jnp.concatenate([one[0].ravel() for one in found]) / size
-    slope = jnp.concatenate([one[1].reshape(-1, count) for one in found]) / size
+    residual, slope = found[0].ravel() / size, found[1].reshape(-1, count) / size
     # A number that the residuals push against its bound stays there; the others move without it.
     lower, upper = (part[:count] for part in program.box())
     gradient = residual @ slope
     is_held = ((point[:count] <= lower) & (gradient > 0)) | ((point[:count] >= upper) & (gradient < 0))
     slope = slope * jnp.where(is_held, 0.0, program.coordinates.scale)
     if program.free_start:
-        blocks = jax.scipy.linalg.block_diag(*(window for one in found for window in one[2])) / size
-        slope = jnp.concatenate([slope, blocks], axis=1)
+        slope = jnp.concatenate([slope, jax.scipy.linalg.block_diag(*found[2]) / size], axis=1)
     return point, residual, slope
 
 
-def _correlation(windows: Sequence[Windows], found: list[tuple[np.ndarray, ...]]) -> float:
+def _correlation(windows: Windows, residual: np.ndarray) -> float:
     """Return the correlation of residuals with those of the same signal one time before, from -1 to 1."""
     products = squares = 0.0
-    for window, (residual, *_) in zip(windows, found, strict=True):
-        shapes = [weight.shape for weight in window.weight.values()]
-        ends = np.cumsum([math.prod(shape[1:]) for shape in shapes])
-        for shape, part in zip(shapes, np.split(residual, ends[:-1], axis=1), strict=True):
-            signal = part.reshape(shape)
-            products += float((signal[:, 1:] * signal[:, :-1]).sum())
-            squares += float((signal**2).sum())
+    shapes = [weight.shape for weight in windows.weight.values()]
+    ends = np.cumsum([math.prod(shape[1:]) for shape in shapes])
+    for shape, part in zip(shapes, np.split(residual, ends[:-1], axis=1), strict=True):
+        signal = part.reshape(shape)
+        products += float((signal[:, 1:] * signal[:, :-1]).sum())
+        squares += float((signal**2).sum())
     return products / squares if squares else 0.0
 
 
-def _without_offsets(found: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, np.ndarray, int]:
+def _without_offsets(
+    residual: np.ndarray, slope: np.ndarray, by_offset: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Return residuals, their derivative by the values orthogonal to the effect of offsets, and the number of offsets."""
-    parts, count = [], 0
-    for _, slope, *of_offset in found:
-        for i, one in enumerate(slope):
-            if of_offset:
-                left, sizes, _ = np.linalg.svd(of_offset[0][i], full_matrices=False)
-                left = left[:, sizes > 1e-8 * sizes.max(initial=0.0)]
-                one, count = one - left @ (left.T @ one), count + left.shape[1]
-            parts.append(one)
-    return np.concatenate([one[0].ravel() for one in found]), np.concatenate(parts), count
+    parts, count = list(slope), 0
+    for i, of_window in enumerate(() if by_offset is None else by_offset):
+        left, sizes, _ = np.linalg.svd(of_window, full_matrices=False)
+        left = left[:, sizes > 1e-8 * sizes.max(initial=0.0)]
+        parts[i], count = parts[i] - left @ (left.T @ parts[i]), count + left.shape[1]
+    return residual.ravel(), np.concatenate(parts), count

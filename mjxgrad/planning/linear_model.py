@@ -15,8 +15,6 @@ There are three ways to this model:
 - `Analytic` differentiates a step whose solver averages the contact force. The noise is on the distance of contacts, not on
   the state, and the acceleration is solved for after the average. It agrees with the others for impedances far below one.
 
-A key is consumed. With `wrt_state=False` A has no columns, except for a fitted plane; the state's noise still acts.
-
 References:
     Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
     Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic Contact
@@ -40,29 +38,20 @@ from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, St
 from mjxgrad.stepping import Smoothing
 
 _Samples = Float[Array, "N both"]
-_Errors = Float[Array, "n columns"]
 
 
 class LinearModel(eqx.Module):
     """A linear model of a step; under `jax.vmap` every field gains leading axes.
 
     Attributes:
-        A: derivative of the next state's change by the present state's; without columns if it was not asked for.
+        A: derivative of the next state's change by the present state's; NaN, like all, if too few samples are finite.
         B: derivative of the next state's change by the control.
         c: mean next state.
-        A_error: standard error of each entry of `A`; zero without sampling.
-        B_error: standard error of each entry of `B`.
-        c_error: standard error of `c`, in the coordinates of a change.
-        finite_fraction: share of finite samples; the others are left out. If too few are finite, all numbers are NaN.
     """
 
-    A: _Errors
+    A: Float[Array, "n n"]
     B: Float[Array, "n m"]
     c: StateVector
-    A_error: _Errors
-    B_error: Float[Array, "n m"]
-    c_error: ChangeVector
-    finite_fraction: Float[Array, ""]
 
 
 class Smoother(eqx.Module):
@@ -74,9 +63,9 @@ class Smoother(eqx.Module):
 
     @abstractmethod
     def linear_model(
-        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray, *, wrt_state: bool = True
+        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
     ) -> LinearModel:
-        """Return the linear model of the smoothed system."""
+        """Return the linear model of the smoothed system; the key is consumed."""
 
     @abstractmethod
     def scaled(self, factor: ArrayLike) -> "Smoother":
@@ -99,13 +88,11 @@ class Analytic(Smoother):
     def step(self, system, state, control, key):
         return self._smoothed(system).step(state, control)
 
-    def linear_model(self, system, state, control, key, *, wrt_state=True):
+    def linear_model(self, system, state, control, key):
         system = self._smoothed(system)
         noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
-        end, (change,), (jacobian,) = _linearised(system, state, control, noise, wrt_state)
-        is_finite = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change))
-        exact, none = jnp.zeros_like(jacobian), jnp.zeros_like(change)
-        return _model(system, end, jacobian, exact, none, none, is_finite[None], least=1)
+        end, (change,), (jacobian,) = _linearised(system, state, control, noise)
+        return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
 
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)
@@ -160,16 +147,14 @@ class Sampled(Smoother):
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
         nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
         is_finite = jnp.all(jnp.isfinite(value), axis=1)
-        mean, _ = _mean(jnp.where(is_finite[:, None], value, 0.0), is_finite)
-        return system.retract(nominal, mean)
+        return system.retract(nominal, _mean(value, is_finite))
 
-    def linear_model(self, system, state, control, key, *, wrt_state=True):
-        if self.order == "zeroth":
-            return self._zeroth_order(system, state, control, key)
-        return self._first_order(system, state, control, key, wrt_state)
+    def linear_model(self, system, state, control, key):
+        model = self._zeroth_order if self.order == "zeroth" else self._first_order
+        return model(system, state, control, key)
 
     def _first_order(
-        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray, wrt_state: bool
+        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
     ) -> LinearModel:
         """Return the linear model from averaged Jacobians.
 
@@ -178,17 +163,16 @@ class Sampled(Smoother):
         """
         stddev = self._stddev(system, state.dtype, least=2)
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
-        nominal, value, jacobian = _linearised(system, state, control, noise, wrt_state)
+        nominal, value, jacobian = _linearised(system, state, control, noise)
         value, jacobian = value[1:], jacobian[1:]
         is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
         jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
         value = jnp.where(is_finite[:, None], value, 0.0)
         count = is_finite.sum()
-        mean, error = _mean(jacobian, is_finite)
+        mean = _mean(jacobian, is_finite)
         others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
-        seen = noise[:, -jacobian.shape[2] :]
-        rest, rest_error = _mean(value - jnp.einsum("inm,im->in", others, seen), is_finite)
-        return _model(system, nominal, mean, error, rest, rest_error, is_finite, least=2)
+        rest = _mean(value - jnp.einsum("inm,im->in", others, noise), is_finite)
+        return _model(system, nominal, mean, rest, count >= 2)
 
     def _zeroth_order(
         self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
@@ -196,9 +180,7 @@ class Sampled(Smoother):
         """Return the linear model from a plane fitted to samples of the step by least squares.
 
         Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
-        Its errors do not assume that samples scatter alike everywhere (White's, with leverage taken out, HC3): across a contact
-        they do not. The fit needs at least two samples more than coordinates of state and control. A column without noise is
-        zero, with an infinite error.
+        The fit needs at least two samples more than coordinates of state and control. A column without noise is zero.
         """
         least = system.num_changes + system.num_controls + 2
         stddev = self._stddev(system, state.dtype, least)
@@ -211,16 +193,10 @@ class Sampled(Smoother):
         # Too few finite samples make the equations singular. Ones on the diagonal keep them solvable; the result is NaN later.
         enough = is_finite.sum() >= least
         gram = design.T @ design + jnp.where(enough, 0.0, 1.0) * jnp.eye(least - 1)
-        influence = jnp.linalg.solve(gram, design.T)
-        slope = influence @ value
-        leverage = jnp.einsum("ip,pi->i", design, influence)
-        residual = (value - design @ slope) / (1 - jnp.minimum(leverage, 1 - 1e-6))[:, None]
-        error = jnp.sqrt(influence**2 @ residual**2)
+        slope = jnp.linalg.solve(gram, design.T @ value)
         is_seen = stddev[:, None] > 0
-        scale = jnp.where(is_seen, stddev[:, None], 1.0)
-        jacobian = jnp.where(is_seen, slope[1:] / scale, 0.0).T
-        jacobian_error = jnp.where(is_seen, error[1:] / scale, jnp.inf).T
-        return _model(system, nominal, jacobian, jacobian_error, slope[0], error[0], is_finite, least=least)
+        jacobian = jnp.where(is_seen, slope[1:] / jnp.where(is_seen, stddev[:, None], 1.0), 0.0).T
+        return _model(system, nominal, jacobian, slope[0], enough)
 
     def _stddev(self, system: System, dtype: jnp.dtype, least: int) -> Float[Array, " both"]:
         """Return the standard deviations of all coordinates of state and control."""
@@ -273,17 +249,16 @@ def _sampled(
 
 
 def _linearised(
-    system: System, state: StateVector, control: ControlVector, noise: _Samples, wrt_state: bool
-) -> tuple[StateVector, Float[Array, "M n"], Float[Array, "M n columns"]]:
+    system: System, state: StateVector, control: ControlVector, noise: _Samples
+) -> tuple[StateVector, Float[Array, "M n"], Float[Array, "M n both"]]:
     """Return the next state without noise; and changes from it with their derivatives, of it, then of each sample."""
-    columns = jnp.arange(0 if wrt_state else system.num_changes, noise.shape[1])
 
     def sample(noise):
         def moved(change):
-            end = _perturbed(system, state, control, noise.at[columns].add(change))
+            end = _perturbed(system, state, control, noise + change)
             return end, end
 
-        return jax.jacfwd(moved, has_aux=True)(jnp.zeros(columns.size, state.dtype))
+        return jax.jacfwd(moved, has_aux=True)(jnp.zeros_like(noise))
 
     # The step without noise runs in the same batch: a separate call would be compiled a second time.
     jacobians, ends = jax.vmap(sample)(jnp.pad(noise, ((1, 0), (0, 0))))
@@ -294,34 +269,20 @@ def _linearised(
     return ends[0], *jax.vmap(change)(ends, jacobians)
 
 
-def _mean(
-    samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]
-) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Return the mean and standard error of the used samples."""
-    weights = is_used.astype(samples.dtype).reshape(-1, *[1] * (samples.ndim - 1))
-    count = jnp.maximum(weights.sum(), 1)
-    mean = (weights * samples).sum(axis=0) / count
-    variance = (weights * (samples - mean) ** 2).sum(axis=0) / jnp.maximum(count - 1, 1)
-    return mean, jnp.sqrt(variance / count)
+def _mean(samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]) -> Float[Array, "..."]:
+    """Return the mean of the used samples."""
+    used = is_used.reshape(-1, *[1] * (samples.ndim - 1))
+    return jnp.where(used, samples, 0.0).sum(axis=0) / jnp.maximum(is_used.sum(), 1)
 
 
 def _model(
     system: System,
     nominal: StateVector,
-    jacobian: _Errors,
-    jacobian_error: _Errors,
+    jacobian: Float[Array, "n both"],
     change: ChangeVector,
-    change_error: ChangeVector,
-    is_finite: Bool[Array, " N"],
-    *,
-    least: int,
+    exists: Bool[Array, ""],
 ) -> LinearModel:
     """Return the linear model from a Jacobian by state and control; all NaN if too few samples were finite."""
-    exists = is_finite.sum() >= least
-    jacobian, jacobian_error, change, change_error = (
-        jnp.where(exists, x, jnp.nan) for x in (jacobian, jacobian_error, change, change_error)
-    )
-    columns = jacobian.shape[1] - system.num_controls
-    (A, B), (A_error, B_error) = (jnp.split(x, [columns], axis=1) for x in (jacobian, jacobian_error))
-    fraction = is_finite.mean(dtype=jacobian.dtype)
-    return LinearModel(A, B, system.retract(nominal, change), A_error, B_error, change_error, fraction)
+    jacobian, change = (jnp.where(exists, x, jnp.nan) for x in (jacobian, change))
+    A, B = jnp.split(jacobian, [system.num_changes], axis=1)
+    return LinearModel(A, B, system.retract(nominal, change))

@@ -32,12 +32,10 @@ class System(eqx.Module):
 
     Attributes:
         num_changes: dimension n of the tangent space.
-        num_positions: number of its leading coordinates that are positions; the rest are velocities and activations.
         num_controls: dimension m of the control.
     """
 
     num_changes: eqx.AbstractVar[int]
-    num_positions: eqx.AbstractVar[int]
     num_controls: eqx.AbstractVar[int]
 
     @abstractmethod
@@ -84,7 +82,7 @@ class System(eqx.Module):
 
 
 class FunctionSystem(System):
-    """A function of two vectors as a system; all of its states are positions.
+    """A function of two vectors as a system.
 
     Attributes:
         function: function from state and control to the next state.
@@ -93,11 +91,6 @@ class FunctionSystem(System):
     function: Callable[[ChangeVector, ControlVector], ChangeVector] = eqx.field(converter=as_pytree)
     num_changes: int = eqx.field(static=True)
     num_controls: int = eqx.field(static=True)
-
-    @property
-    def num_positions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The number of all states."""
-        return self.num_changes
 
     def step(self, state: ChangeVector, control: ControlVector) -> ChangeVector:
         return self.function(state, control)
@@ -126,10 +119,6 @@ class SceneSystem(System):
     @property
     def num_changes(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return 2 * self.scene.model.nv + self.scene.model.na
-
-    @property
-    def num_positions(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.scene.model.nv
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -187,7 +187,7 @@ def test_costs_by_name_are_what_c_mujoco_says(folder):
         (["block.xml", "--cost", "hight:block"], "cost must be file.py:function, module:function, or of a body as"),
         (["block.xml", "--start", "far"], "keyframe must be one of ['near'] in this scene, got 'far'"),
         (["block.xml", "--stiffness", "0"], "stiffness must be positive and finite, got 0.0"),
-        (["block.xml", "--html", "nowhere/page.html"], "there is no folder nowhere"),
+        (["block.xml", "--html", "nowhere/page.html"], "nowhere/page.html cannot be written"),
         (["block.xml", "--gradient", "slop"], 'Choose from: "slope", "discrete"'),
     ],
 )

@@ -30,8 +30,8 @@ def _mjcf(**changes):
     return SCENE.format(**(given | changes))
 
 
-def _report(speed=None, joint_speed=None, **changes):
-    return mg.check_stability(mg.load_scene(_mjcf(**changes)), speed=speed, joint_speed=joint_speed)
+def _report(speed=None, **changes):
+    return mg.check_stability(mg.load_scene(_mjcf(**changes)), speed=speed)
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0, 5.0])
@@ -40,12 +40,6 @@ def test_the_load_is_the_step_over_the_closed_form_limit_in_the_standard_format(
     limit = 2 * ratio * (np.sqrt(1 + ratio**2) - ratio) * 0.02
     (spring,) = _report(solref=f".02 {ratio}").springs
     assert spring.load == pytest.approx(0.002 / limit, rel=1e-9)
-
-
-def test_the_load_is_one_where_the_direct_format_reaches_its_limit():
-    # h²k + 2hb = 4 at h = 2 ms and b = 100: k = (4 − 0.4) / h²
-    (spring,) = _report(solref=f"{-3.6 / 0.002**2} -100").springs
-    assert spring.load == pytest.approx(1.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.97, 1.03])
@@ -98,7 +92,6 @@ def test_joint_limits_are_looked_at_with_their_own_format_and_remedy():
     report = _report(refsafe="enable", solref=".003 1", limited="true")
     limit = next(spring for spring in report.springs if spring.kind == "joint limit")
     assert limit.name == "slide"
-    assert limit.size == 2.0
     assert any(text.startswith("joint limit of slide") and "the direct format" in text for text in report.warnings)
 
 

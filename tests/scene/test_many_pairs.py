@@ -15,6 +15,8 @@ def _balls(count: int) -> str:
 def test_too_many_pairs_are_refused():
     with pytest.raises(SceneError, match=r"at most 20000 pairs .* got more"):
         mg.load_scene(_balls(300), engine="mjx")
+    with pytest.warns(mg.scene.SceneWarning, match="C MuJoCo steps it: .*got more"):
+        assert mg.load_scene(_balls(300)).engine == "mujoco"
 
 
 def test_pairs_that_are_excluded_do_not_count(monkeypatch):
