@@ -19,7 +19,7 @@ from experiments import theme
 from experiments.config import ExperimentError, suggest
 from experiments.problems import estimators as library
 from experiments.problems import textbook
-from experiments.problems.comparison import Comparison, Rollouts, compare
+from experiments.problems.comparison import Comparison, compare
 from experiments.problems.textbook import Textbook
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings, SettingsTable
@@ -144,7 +144,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 problem.objective(settings.stddev),
                 jnp.array([settings.point]),
                 jax.random.fold_in(key, i),
-                budget=Rollouts(rollouts),
+                budget=rollouts,
                 reference=np.asarray(problem.gradient(settings.point, settings.stddev)),
                 num_repeats=settings.num_repeats,
                 confidence=settings.confidence,
@@ -166,13 +166,12 @@ def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tabl
     dims, stiffness = ("setting", "estimator"), [np.nan if one is None else one for one, _ in cells]
     labels = [one.label for one in settings.estimators]
     data = xr.Dataset(coords={"estimator": labels, "stiffness": ("setting", stiffness)})
-    one_each = ("num_samples", "num_rollouts", "num_gradient_rollouts", "num_finite", "claimed_variance")
-    for name in (*one_each, "mean", "bias", "rmse", "variance"):
+    one_each = ("num_samples", "num_rollouts", "num_finite", "claimed_variance", "variance")
+    for name in (*one_each, "mean", "bias", "rmse"):
         data[name] = dims, np.stack([getattr(table, name).reshape(len(labels)) for table in tables])
-    for name in ("bias", "rmse", "variance"):
+    for name in ("bias", "rmse"):
         ends = np.stack([getattr(table, f"{name}_interval").reshape(2, len(labels)) for table in tables], axis=1)
         data[f"{name}_low"], data[f"{name}_high"] = (dims, ends[0]), (dims, ends[1])
-    data["variance_method"] = dims, [table.variance_methods for table in tables]
     exact = [[_exact_error(one, settings, *cell) for one in settings.estimators] for cell in cells]
     return data.assign(exact_rmse=(dims, exact))
 

@@ -18,8 +18,8 @@ from experiments.motion import own_task
 from experiments.optimisation import searches
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.problems import estimators, published_scenes
-from experiments.problems.comparison import Comparison, Rollouts, affordable, bias_interval, compare
+from experiments.problems import estimators
+from experiments.problems.comparison import Comparison, affordable, bias_interval, compare
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import mean_interval
@@ -186,7 +186,6 @@ class Outcome:
         return [
             {
                 "task": self.settings.scene or self.settings.task,
-                "dynamics": self.settings.dynamics,
                 "method": run.method.label,
                 "seed": seed,
                 "rollouts": int(run.rollouts[i]),
@@ -201,26 +200,8 @@ class Outcome:
         ]
 
 
-_SCENES = {
-    "push_soft": lambda: published_scenes.push(10.0),
-    "push_stiff": lambda: published_scenes.push(1000.0),
-    "friction": published_scenes.friction,
-    "motion_planning": published_scenes.motion_planning,
-    "tennis": published_scenes.tennis,
-}
 _OWN = {"num_samples": 16, "learning_rate": 1.0, "num_steps": 100, "gamma": 1.0, "bound": 1.0}
 _ELITE = 0.2  # share of the candidates that cross-entropy fits to
-# How to optimise the scenes; found by trying, so that few steps show what each is about.
-_PUSH = {"num_samples": 10, "learning_rate": 1e-3, "num_steps": 200, "gamma": 1e8, "bound": 100.0}
-_SCENE_SETTINGS = {
-    "push_soft": _PUSH,
-    "push_stiff": _PUSH,
-    "friction": {"num_samples": 10, "learning_rate": 1e-4, "num_steps": 100, "gamma": 2e4, "bound": 100.0},
-    "motion_planning": {"num_samples": 50, "learning_rate": 0.03, "num_steps": 100, "gamma": 150.0, "bound": 10.0},
-    "tennis": {
-        "num_samples": 100, "learning_rate": 1e-6, "num_steps": 60, "gamma": 1000.0, "bound": 1000.0, "num_starts": 500
-    },
-}  # fmt: skip
 
 
 def problem(settings: Settings) -> Published:
@@ -232,21 +213,10 @@ def problem(settings: Settings) -> Published:
         objective = mg.open_loop(task, settings.stddev * jnp.asarray(half_range(task.scene)))
         start = jnp.tile(task.scene.data.ctrl, task.horizon)
         found = Published(objective, start, reference={}, **_OWN)
-    elif settings.dynamics == "published":
-        found = TASKS[str(settings.task)]()
     else:
-        task = _SCENES[str(settings.task)]()
-        # What is published of the equations does not hold for the scene.
-        found = Published(task.objective(), task.initial_params(), reference={}, **_SCENE_SETTINGS[str(settings.task)])
+        found = TASKS[str(settings.task)]()
     chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
     return replace(found, **chosen, reference={}) if chosen else found
-
-
-def scene(settings: Settings) -> mg.Scene | None:
-    """Give the scene of the task; None under the published equations, which have none."""
-    if settings.scene is not None:
-        return own_task(settings).scene
-    return None if settings.dynamics == "published" else _SCENES[str(settings.task)]().scene
 
 
 def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
@@ -270,7 +240,7 @@ def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Call
     if method.is_search:
         return _search(method, task)
     function = estimator(method, task)
-    afforded = affordable(function, task.objective, task.params, key, Rollouts(task.num_samples)).num_samples
+    afforded = affordable(function, task.objective, task.params, key, task.num_samples)
 
     def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
         return mg.optimise(
@@ -301,8 +271,8 @@ def _search(method: MethodSettings, task: Published) -> Callable[..., mg.Optimis
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Run every method from every seed, and estimate the gradient at the start many times."""
     task = problem(settings)
-    if (simulated := scene(settings)) is not None:
-        workspace.check(simulated)
+    if settings.scene is not None:
+        workspace.check(own_task(settings).scene)
     run_key, error_key = jax.random.split(jax.random.key(settings.seed))
     runs = []
     with workspace.stage("optimisation", "methods", len(settings.methods)) as advance_to:
@@ -369,7 +339,7 @@ def _errors(task: Published, settings: Settings, key: jax.Array, workspace: Work
     if not named:
         return None
     reference_key, repeats_key = jax.random.split(key)
-    with workspace.stage("errors of one estimate", "estimators", 1 + len(named)) as advance_to:
+    with workspace.stage("errors of one estimate", "parts", 2) as advance_to:
         # Unbiased, and never much worse than zeroth order.
         reference = jax.jit(
             lambda at: mg.estimators.control_variate(
@@ -382,9 +352,8 @@ def _errors(task: Published, settings: Settings, key: jax.Array, workspace: Work
             task.objective,
             jnp.asarray(task.params),
             repeats_key,
-            budget=Rollouts(task.num_samples),
+            budget=task.num_samples,
             reference=(np.asarray(reference.value), np.asarray(reference.standard_error)),
             num_repeats=settings.error_repeats,
             confidence=settings.confidence,
-            progress=lambda done, _: advance_to(1 + done),
         )

@@ -85,8 +85,6 @@ class Settings(OwnScene, RunSettings):
     """What is optimised; see `experiments.optimisation.published`. A scene of one's own, by its controls, takes its place."""
     stddev: Positive = 0.1
     """Of the noise on each control of an own scene, in halves of its range."""
-    dynamics: Literal["published", "mjx"] = "published"
-    """Whether the paper's own equations simulate the task, or MJX with contact, as it does an own scene."""
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]
     """In the order of the table."""
     seeds: Count = 10
@@ -115,6 +113,4 @@ class Settings(OwnScene, RunSettings):
             raise ValueError("task: required where there is no scene, and missing")
         if self.scene is not None and self.learning_rate is None:
             raise ValueError("learning_rate: required with a scene of one's own, and missing; in control² per cost")
-        if self.dynamics == "mjx" and self.task == "lqr":
-            raise ValueError('dynamics: must be "published" for lqr, which has no contact to simulate')
         return self

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.policy_gradient.settings import Settings
-from experiments.problems.published_scenes import push
+from experiments.problems.push import push
 from experiments.workspace import Workspace
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.rules import Consistent

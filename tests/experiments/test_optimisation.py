@@ -184,7 +184,6 @@ def test_published_results_stand_beside_the_methods_that_they_are_of():
     [
         ({"methods": [{"name": "first_order", "rule": "concavity"}, {"name": "mppi"}]}, "first_order takes no rule"),
         ({"methods": [{"name": "mppi"}, {"name": "mppi"}]}, "methods must differ, got MPPI more than once"),
-        ({"task": "lqr", "dynamics": "mjx"}, 'must be "published" for lqr'),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(change, words):
