@@ -18,12 +18,12 @@ from experiments.motion import own_task
 from experiments.optimisation import searches
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.problems import estimators
-from experiments.problems.comparison import Comparison, affordable, bias_interval, compare
+from experiments.problems.comparison import affordable, bias_interval
+from experiments.problems.estimators import estimator
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import mean_interval
-from mjxgrad.estimators import GradientEstimate, Reason, rules
+from mjxgrad.estimators import Reason
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
 ROUNDING = 1e-6
@@ -146,7 +146,6 @@ class Outcome:
     # Published mean and standard deviation of the final cost, by what they belong to.
     reference: dict[str, tuple[float, float]]
     runs: list[Run]  # in the order of the settings
-    errors: Comparison | None  # of one estimate at the start, of the methods that estimate; None if it was not measured
 
     @functools.cached_property
     def verdicts(self) -> list[Difference]:
@@ -172,14 +171,6 @@ class Outcome:
         if method.name != "alpha_order" or method.control_variate is not False:
             return None
         return self.reference.get({"bias_constrained": "alpha", "concavity": "ddcg"}.get(method.rule or "", ""))
-
-    def relative_error(self, run: Run) -> Float[np.ndarray, " 3"] | None:
-        """Give the error of one estimate at the start over the gradient's norm, with its interval."""
-        if self.errors is None or run.method.label not in self.errors.names:
-            return None
-        row = self.errors.names.index(run.method.label)
-        ends = self.errors.rmse_interval[:, row]
-        return np.array([self.errors.rmse[row], *ends]) / np.linalg.norm(self.errors.reference)
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per method, seed and evaluation, for metrics.csv."""
@@ -219,19 +210,6 @@ def problem(settings: Settings) -> Published:
     return replace(found, **chosen, reference={}) if chosen else found
 
 
-def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
-    """Give a function of `mjxgrad.estimators`, its options bound; its rule may take the published constants of the task."""
-    options = method.options
-    if method.rule is not None:
-        options["rule"] = {
-            "consistent": rules.Consistent,
-            "inverse_variance": rules.InverseVariance,
-            "concavity": rules.Concavity,
-            "bias_constrained": lambda: rules.BiasConstrained(task.gamma, task.bound),
-        }[method.rule]()
-    return functools.partial(getattr(estimators, method.name), **options)
-
-
 def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Callable[..., mg.Optimisation]:
     """Give the function that runs a method, of keys, one per seed, and of the options of `mg.optimise`.
 
@@ -239,7 +217,7 @@ def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Call
     """
     if method.is_search:
         return _search(method, task)
-    function = estimator(method, task)
+    function = estimator(method, task.gamma, task.bound)
     afforded = affordable(function, task.objective, task.params, key, task.num_samples)
 
     def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
@@ -269,21 +247,18 @@ def _search(method: MethodSettings, task: Published) -> Callable[..., mg.Optimis
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Run every method from every seed, and estimate the gradient at the start many times."""
+    """Run every method from every seed."""
     task = problem(settings)
     if settings.scene is not None:
         workspace.check(own_task(settings).scene)
-    run_key, error_key = jax.random.split(jax.random.key(settings.seed))
+    key = jax.random.key(settings.seed)
     runs = []
     with workspace.stage("optimisation", "methods", len(settings.methods)) as advance_to:
         for i, method in enumerate(settings.methods):
             # Other noise for every method: the tests of their differences take runs to be independent.
-            run = functools.partial(_run, method, task, settings, jax.random.fold_in(run_key, i))
+            run = functools.partial(_run, method, task, settings, jax.random.fold_in(key, i))
             runs.append(workspace.once(f"{i}", run))
             advance_to(len(runs))
-    errors = None
-    if settings.error_repeats > 1:
-        errors = workspace.once("errors", lambda: _errors(task, settings, error_key, workspace))
     return Outcome(
         settings=settings,
         num_samples=task.num_samples,
@@ -292,7 +267,6 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         start_cost=float(jax.jit(task.final_cost)(task.params)),
         reference=dict(task.reference),
         runs=runs,
-        errors=errors,
     )
 
 
@@ -332,28 +306,3 @@ def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     names = ["fixed", "inverse_variance", "bias_limit", "uncertain", "inconsistent", "not_finite", "nothing_felt"]
     found = {name: np.asarray(history.reason == getattr(Reason, name)) & was_done for name in names}
     return {name: where for name, where in found.items() if where.any()}
-
-
-def _errors(task: Published, settings: Settings, key: jax.Array, workspace: Workspace) -> Comparison | None:
-    named = {one.label: estimator(one, task) for one in settings.methods if not one.is_search}
-    if not named:
-        return None
-    reference_key, repeats_key = jax.random.split(key)
-    with workspace.stage("errors of one estimate", "parts", 2) as advance_to:
-        # Unbiased, and never much worse than zeroth order.
-        reference = jax.jit(
-            lambda at: mg.estimators.control_variate(
-                task.objective, at, reference_key, num_samples=settings.reference_samples
-            )
-        )(task.params)
-        advance_to(1)
-        return compare(
-            named,
-            task.objective,
-            jnp.asarray(task.params),
-            repeats_key,
-            budget=task.num_samples,
-            reference=(np.asarray(reference.value), np.asarray(reference.standard_error)),
-            num_repeats=settings.error_repeats,
-            confidence=settings.confidence,
-        )

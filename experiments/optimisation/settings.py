@@ -97,10 +97,6 @@ class Settings(OwnScene, RunSettings):
     """Of plain gradient descent; without it, as published."""
     evaluations: Annotated[int, Field(ge=1)] = 50
     """How often the cost without noise is measured on the way."""
-    error_repeats: Annotated[int, Field(ge=0)] = 100
-    """Estimates at the start of which the relative error is measured; 0 leaves it out."""
-    reference_samples: Annotated[int, Field(ge=100)] = 50_000
-    """Rollouts behind the gradient that those are compared with."""
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
 

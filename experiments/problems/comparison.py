@@ -6,8 +6,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from mjxgrad.diagnostics.bias_variance import map_in_chunks
@@ -31,13 +31,12 @@ class Comparison(eqx.Module):
         num_finite: number of finite estimates; all fields below use these alone.
         mean: mean estimate.
         bias: mean less reference.
-        bias_interval: lower and upper end of Welch's interval, with the reference's own error.
-        rmse: root-mean-square distance to the truth, corrected for the reference's variance.
+        bias_interval: lower and upper end of Student's interval.
+        rmse: root-mean-square distance to the truth.
         rmse_interval: lower and upper end, see `root_mean_square_interval`.
         variance: trace of the covariance of the estimates.
         claimed_variance: mean variance claimed by the estimates, the sum of their squared standard errors; an honest
             estimator has it equal to `variance`.
-        reference: the true gradient.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -51,7 +50,6 @@ class Comparison(eqx.Module):
     rmse_interval: Float[np.ndarray, "2 estimators"]
     variance: Float[np.ndarray, " estimators"]
     claimed_variance: Float[np.ndarray, " estimators"]
-    reference: Float[np.ndarray, " dim"]
 
 
 def compare(
@@ -61,7 +59,7 @@ def compare(
     key: PRNGKeyArray,
     *,
     budget: int,
-    reference: tuple[ArrayLike, ArrayLike] | ArrayLike,
+    reference: ArrayLike,
     num_repeats: int = 200,
     confidence: float = 0.95,
 ) -> Comparison:
@@ -77,8 +75,7 @@ def compare(
         params: the point.
         key: consumed here.
         budget: rollouts of one estimate, as the estimate itself counts them. At least 2.
-        reference: the true gradient and its standard error; or the gradient alone if it is exact (a closed form). The error
-            must be well known, from many more samples than an estimate has.
+        reference: the true gradient, of the shape of `params`.
         num_repeats: number of estimates per estimator. At least 2.
         confidence: coverage of the intervals.
 
@@ -94,7 +91,9 @@ def compare(
         raise ValueError("estimators must have at least one entry, got none")
     if num_repeats < 2:
         raise ValueError(f"num_repeats must be at least 2, got {num_repeats}")
-    truth, error = _reference(reference, params.shape)
+    truth = np.asarray(reference, float)
+    if truth.shape != params.shape or not np.isfinite(truth).all():
+        raise ValueError(f"reference must be finite, of the shape {params.shape} of params, got {truth}")
     timing_key, repeats_key = jax.random.split(key)
     rows = []
     for name, estimator in estimators.items():
@@ -105,10 +104,10 @@ def compare(
         at_a_time = max(1, min(num_repeats, _ROLLOUTS_AT_A_TIME // num_samples))
         keys = jax.random.split(repeats_key, num_repeats)
         estimates = jax.tree.map(np.asarray, _repeat(estimator, objective, params, keys, num_samples, at_a_time))
-        rows.append({"num_samples": num_samples, **_row(name, estimates, truth, error, confidence)})
+        rows.append({"num_samples": num_samples, **_row(name, estimates, truth, confidence)})
     columns = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
     intervals = {name: np.moveaxis(columns.pop(name), 1, 0) for name in list(columns) if name.endswith("interval")}
-    return Comparison(names=tuple(estimators), reference=truth, **columns, **intervals)
+    return Comparison(names=tuple(estimators), **columns, **intervals)
 
 
 @eqx.filter_jit
@@ -124,11 +123,7 @@ def _repeat(
 
 
 def _row(
-    name: str,
-    estimates: GradientEstimate,
-    truth: Float[np.ndarray, " dim"],
-    error: Float[np.ndarray, " dim"],
-    confidence: float,
+    name: str, estimates: GradientEstimate, truth: Float[np.ndarray, " dim"], confidence: float
 ) -> dict[str, object]:
     """Compute all columns for one estimator."""
     is_finite = np.isfinite(estimates.value).all(axis=-1)
@@ -141,41 +136,18 @@ def _row(
     values = np.asarray(estimates.value, float)[is_finite]
     mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
     bias = mean - truth
-    rmse, rmse_ends = root_mean_square_interval(
-        ((values - truth) ** 2).sum(axis=1),
-        confidence,
-        reference_variance=(error**2).sum(),
-        cross_variance=(4 * (bias * error) ** 2 + 2 * error**4).sum(),
-    )
+    rmse, rmse_ends = root_mean_square_interval(((values - truth) ** 2).sum(axis=1), confidence)
     return {
         "num_rollouts": estimates.num_rollouts.flat[0],
         "num_finite": count,
         "mean": mean,
         "bias": bias,
-        "bias_interval": bias_interval(mean, spread / np.sqrt(count), count, truth, error, confidence=confidence),
+        "bias_interval": bias_interval(mean, spread / np.sqrt(count), count, truth, confidence=confidence),
         "rmse": rmse,
         "rmse_interval": rmse_ends,
         "variance": float((spread**2).sum()),
         "claimed_variance": float((np.asarray(estimates.standard_error, float)[is_finite] ** 2).sum(axis=1).mean()),
     }
-
-
-def _reference(
-    reference: tuple[ArrayLike, ArrayLike] | ArrayLike, shape: tuple[int, ...]
-) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
-    both = reference if isinstance(reference, tuple) else (reference, 0.0)
-    value, error = (np.asarray(one, float) for one in both)
-    # One number is enough for one parameter.
-    value = value.reshape(shape) if value.shape == () and shape == (1,) else value
-    if value.shape != shape or error.shape not in ((), shape):
-        raise ValueError(
-            f"reference must have the shape {shape} of params, got {value.shape} with an error of shape {error.shape}; "
-            "pass (value, standard_error), or the value alone if it is exact"
-        )
-    error = np.broadcast_to(error, shape)
-    if not np.isfinite(value).all() or not (error >= 0).all():
-        raise ValueError(f"reference must be finite with errors of at least 0, got {value} ± {error}")
-    return value, error
 
 
 def affordable(
@@ -262,9 +234,6 @@ def bias_interval(
 def root_mean_square_interval(
     squared_errors: Float[np.ndarray, "*batch repeats"],
     confidence: float = 0.95,
-    *,
-    reference_variance: ArrayLike = 0.0,
-    cross_variance: ArrayLike = 0.0,
 ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "2 *batch"]]:
     r"""Return the root-mean-square error of an estimate from its repetitions, with an interval.
 
@@ -272,18 +241,12 @@ def root_mean_square_interval(
     (a chi-square with Satterthwaite's degrees of freedom). For one unbiased normal coordinate with known kurtosis it is exact.
     Where a bias dominates it becomes the usual normal interval.
 
-    The variance $v$ of a reference adds to the mean and is subtracted. The error of the reference is common to all
-    repetitions, so it widens the interval.
-
     Args:
         squared_errors: squared distance of each repetition to the reference.
         confidence: coverage of the interval.
-        reference_variance: $v$, the sum over coordinates of the reference's squared standard errors.
-        cross_variance: $\sum_j (2 b_j e_j)^2 + 2 e_j^4$, the variance that the error $e$ of the reference adds to the mean,
-            with the bias $b$.
 
     Returns:
-        The root-mean-square error, zero where the reference's error hides it, and the ends of its interval.
+        The root-mean-square error, and the ends of its interval.
 
     Raises:
         ValueError: if `confidence` is not between 0 and 1.
@@ -295,11 +258,10 @@ def root_mean_square_interval(
     squared_errors = np.asarray(squared_errors, float)
     repeats = squared_errors.shape[-1]
     mean = squared_errors.mean(axis=-1)
-    variance = squared_errors.var(axis=-1, ddof=1) / repeats + np.asarray(cross_variance, float)
+    variance = squared_errors.var(axis=-1, ddof=1) / repeats
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = 2 * mean**2 / variance
         ends = [mean * freedom / stats.chi2.isf(tail, freedom), mean * freedom / stats.chi2.ppf(tail, freedom)]
     # All errors are equal up to rounding: the mean is known.
     ends = np.where(freedom < 1e12, ends, mean)
-    taken_off = np.asarray(reference_variance, float)
-    return np.asarray(np.sqrt(np.maximum(mean - taken_off, 0))), np.sqrt(np.maximum(ends - taken_off, 0))
+    return np.sqrt(mean), np.sqrt(ends)
