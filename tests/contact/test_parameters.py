@@ -54,7 +54,7 @@ def touching(scene):
 
 
 @pytest.mark.parametrize("name", GEOMS)
-def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, name):
+def test_parameters_are_those_of_c_mujocos_contacts_and_of_their_rows(scene, touching, name):
     geom = scene.mj_model.geom(name).id
     contact = next(c for c in touching.contact if geom in c.geom)
     row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
@@ -64,14 +64,6 @@ def test_parameters_are_those_that_c_mujoco_gives_its_contacts(scene, touching, 
     np.testing.assert_allclose(ours.solimp[row], contact.solimp, rtol=1e-12)
     np.testing.assert_allclose(ours.friction[row], contact.friction, rtol=1e-12)
     np.testing.assert_allclose(ours.margin[row], contact.includemargin, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", GEOMS)
-def test_stiffness_and_damping_are_those_of_the_rows_of_c_mujoco(scene, touching, name):
-    geom = scene.mj_model.geom(name).id
-    contact = next(c for c in touching.contact if geom in c.geom)
-    row = next(i for i, pair in enumerate(scene.pairs) if name in pair.names and "floor" in pair.names)
-    ours = jax.tree.map(np.asarray, scene.contact_parameters())
     stiffness, damping, _, _ = touching.efc_KBIP[contact.efc_address]
     width = ours.impedance[row, 1]
     # K = k / dw² and B = b / dw.
@@ -137,15 +129,12 @@ def test_a_contact_gains_energy_beyond_the_stability_limit(integrator, damping_r
     assert (abs(data.qpos[0] / rest - 1) > 1e-3) == grows
 
 
-def test_the_limit_of_semi_implicit_euler_is_that_of_the_closed_form():
-    # h²k + 2hb = 4 with k = ω², b = 2ζω.
+def test_limits_are_those_of_the_closed_forms():
+    # Semi-implicit Euler: h²k + 2hb = 4 with k = ω², b = 2ζω.
     for ratio in (0.0, 0.3, 1.0, 30.0):
         step = largest_stable_step(ratio, mujoco.mjtIntegrator.mjINT_EULER)
         np.testing.assert_allclose(step**2 + 4 * ratio * step, 4, rtol=1e-12)
-
-
-def test_the_limit_of_runge_kutta_is_that_of_the_textbook():
-    # On the imaginary axis |R(iy)| = 1 at y = 2√2.
+    # Runge-Kutta: on the imaginary axis |R(iy)| = 1 at y = 2√2.
     step = largest_stable_step(0.0, mujoco.mjtIntegrator.mjINT_RK4)
     np.testing.assert_allclose(step, 2 * np.sqrt(2), rtol=1e-9)
 

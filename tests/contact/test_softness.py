@@ -46,19 +46,14 @@ def _row(scene, *names):
     return next(i for i, pair in enumerate(scene.pairs) if set(pair.names) == set(names))
 
 
-def test_every_pair_gets_the_values_asked_for(unequal):
-    softness = Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
-    got = unequal.with_softness(softness).contact_parameters()
+def test_every_pair_gets_the_values_asked_for_and_c_mujoco_sees_the_same(unequal):
+    soft = unequal.with_softness(Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02))
+    got, model = soft.contact_parameters(), soft.to_mujoco()
     np.testing.assert_allclose(got.stiffness, 900, rtol=1e-12)
     # b = 2ζ√k
     np.testing.assert_allclose(got.damping, 2 * 0.7 * 30, rtol=1e-12)
     np.testing.assert_allclose(got.impedance, [[0.3, 0.6]] * len(unequal.pairs), rtol=1e-12)
     np.testing.assert_allclose(got.width, 0.02, rtol=1e-12)
-
-
-def test_c_mujoco_sees_the_same_softness(unequal):
-    softness = Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
-    model = unequal.with_softness(softness).to_mujoco()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     assert data.ncon == 3
@@ -139,30 +134,26 @@ def test_a_pair_decided_by_priority_needs_only_the_winner(unequal):
         np.testing.assert_allclose(after.stiffness[_row(unequal, *names)], expected, rtol=1e-12)
 
 
-def test_a_geom_shared_with_an_unselected_pair_is_refused(equal):
-    with pytest.raises(ValueError, match=r"would also change the pair .*shares the geom.*<pair>"):
-        equal.with_softness(Softness(stiffness=900, damping_ratio=1, pairs=(("one", "floor"),)))
-
-
-@pytest.mark.parametrize("subset", [{"geoms": ("flor",)}, {"pairs": (("one", "flor"),)}])
-def test_an_unknown_name_is_answered_with_the_known_ones(equal, subset):
-    with pytest.raises(ValueError, match=r"flor.*those that can: .*floor"):
-        equal.with_softness(Softness(stiffness=900, damping_ratio=1, **subset))
-
-
-def test_both_kinds_of_subset_at_once_are_refused():
-    with pytest.raises(ValueError, match="either geoms or pairs"):
-        Softness(geoms=("a",), pairs=(("a", "b"),))
-
-
 @pytest.mark.parametrize(
-    ("part", "value", "requirement"),
-    [("stiffness", 0.0, "positive"), ("damping_ratio", -1, "at least 0"),
-     ("impedance", 1.5, "between 0 and 1"), ("width", 0, "positive")],
-)  # fmt: skip
-def test_values_without_meaning_are_refused(part, value, requirement):
-    with pytest.raises(ValueError, match=f"{part} must be {requirement}"):
-        Softness(**{part: value})
+    ("parts", "sentence"),
+    [
+        ({"pairs": (("one", "floor"),)}, r"would also change the pair .*shares the geom.*<pair>"),
+        ({"geoms": ("flor",)}, r"flor.*those that can: .*floor"),
+        ({"pairs": (("one", "flor"),)}, r"flor.*those that can: .*floor"),
+        ({"geoms": ("a",), "pairs": (("a", "b"),)}, "either geoms or pairs"),
+        ({"stiffness": 0.0}, "stiffness must be positive"),
+        ({"damping_ratio": -1}, "damping_ratio must be at least 0"),
+        ({"impedance": 1.5}, "impedance must be between 0 and 1"),
+        ({"width": 0}, "width must be positive"),
+        ({"stiffness": [1, 2]}, r"stiffness must be one value.*vmap"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(equal, parts, sentence):
+    """Of others than those asked for, of names that there are not, of values, and of a sweep without `jax.vmap`."""
+    is_sweep = isinstance(parts.get("stiffness"), list)
+    make = Softness.sweep if is_sweep else Softness
+    with pytest.raises(ValueError, match=sentence):
+        equal.with_softness(make(**({"stiffness": 900, "damping_ratio": 1} | parts)))
 
 
 def test_a_sweep_is_one_vmap(unequal):
@@ -172,11 +163,6 @@ def test_a_sweep_is_one_vmap(unequal):
     np.testing.assert_allclose(got.stiffness, np.tile(stiffness[:, None], len(unequal.pairs)))
     np.testing.assert_allclose(got.impedance[..., 0], 0.2)
     np.testing.assert_allclose(got.impedance[..., 1], 0.4)
-
-
-def test_a_sweep_without_vmap_is_refused(unequal):
-    with pytest.raises(ValueError, match=r"stiffness must be one value.*vmap"):
-        unequal.with_softness(Softness.sweep(stiffness=[1, 2], damping_ratio=1))
 
 
 def test_derivatives_are_those_of_the_closed_form(unequal):

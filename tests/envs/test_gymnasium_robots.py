@@ -81,25 +81,13 @@ def both(request):
     return request.param, (np.stack(obs), np.array(reward), np.array(over), terms), told
 
 
-def test_observations_are_theirs(both):
-    _, (obs, *_), (seen, *_) = both
-    np.testing.assert_array_equal(seen, obs)
-
-
-@pytest.mark.parametrize(("ours", "theirs"), [("forward", "forward"), ("control", "ctrl"), ("alive", "survive")])
-def test_each_term_of_the_reward_is_theirs(both, ours, theirs):
+def test_observations_rewards_with_each_of_their_terms_and_ends_are_theirs(both):
     """A speed is a difference of places of about 1 m over 8 ms at least: rounding is 1e-16 / 8e-3."""
-    _, (*_, terms), (_, rewards, _) = both
-    np.testing.assert_allclose(rewards[ours], terms[f"reward_{theirs}"], rtol=1e-13, atol=1e-13)
-
-
-def test_rewards_are_theirs(both):
-    _, (_, reward, *_), (_, rewards, _) = both
+    name, (obs, reward, over, terms), (seen, rewards, is_over) = both
+    np.testing.assert_array_equal(seen, obs)
+    for ours, theirs in (("forward", "forward"), ("control", "ctrl"), ("alive", "survive")):
+        np.testing.assert_allclose(rewards[ours], terms[f"reward_{theirs}"], rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(sum(rewards.values()), reward, rtol=1e-13, atol=1e-13)
-
-
-def test_ends_are_theirs(both):
-    name, (_, _, over, _), (*_, is_over) = both
     np.testing.assert_array_equal(is_over, over)
     if name != "half_cheetah":
         assert over.any()

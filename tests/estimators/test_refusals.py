@@ -128,30 +128,35 @@ def test_wrong_choices_are_answered_with_what_is_right(key, estimator, settings,
         estimator(parameter_noise(textbook.step, 0.1), POINT, key, **settings)
 
 
-def test_parameters_of_the_wrong_length_are_refused(key):
-    objective = parameter_noise(textbook.step, 0.1, dim=1)
-    with pytest.raises(ValueError, match=r"params must have shape \(1,\), got \(2,\)"):
-        first_order(objective, jnp.array([0.1, 0.2]), key, num_samples=8)
-
-
-def test_a_function_that_is_no_scalar_is_refused(key):
-    with pytest.raises(ValueError, match=r"function must return a scalar of shape \(\), got shape \(1,\)"):
-        first_order(parameter_noise(lambda x: x**2, 0.1), POINT, key, num_samples=8)
-
-
-def test_noise_of_no_width_is_refused():
-    for stddev in (0.0, -0.1, float("nan")):
-        with pytest.raises(ValueError, match="stddev must be positive, got"):
-            parameter_noise(textbook.step, stddev)
-
-
-def test_noise_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match=r"stddev must be one number or 3, got shape \(2,\)"):
-        parameter_noise(textbook.bumpy, jnp.array([0.1, 0.2]), dim=3)
-    with pytest.raises(ValueError, match=r"stddev must broadcast to \(horizon, nu\) = \(4, 1\), got \(3,\)"):
-        open_loop(textbook.LinearSystem(), jnp.array([0.1, 0.2, 0.3]))
-
-
-def test_action_noise_needs_actions():
-    with pytest.raises(ValueError, match=r"action noise needs controls, got a task of \(horizon, nu\) = \(4, 0\)"):
-        closed_loop(textbook.LinearSystem(num_controls=0), textbook.linear_policy, 0.1)
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (
+            lambda key: first_order(parameter_noise(textbook.step, 0.1, dim=1), jnp.ones(2), key, num_samples=8),
+            r"params must have shape \(1,\), got \(2,\)",
+        ),
+        (
+            lambda key: first_order(parameter_noise(lambda x: x**2, 0.1), POINT, key, num_samples=8),
+            r"function must return a scalar of shape \(\), got shape \(1,\)",
+        ),
+        *(
+            (lambda _, x=x: parameter_noise(textbook.step, x), "stddev must be positive, got")
+            for x in (0, -0.1, np.nan)
+        ),
+        (
+            lambda _: parameter_noise(textbook.bumpy, jnp.array([0.1, 0.2]), dim=3),
+            r"stddev must be one number or 3, got shape \(2,\)",
+        ),
+        (
+            lambda _: open_loop(textbook.LinearSystem(), jnp.array([0.1, 0.2, 0.3])),
+            r"stddev must broadcast to \(horizon, nu\) = \(4, 1\), got \(3,\)",
+        ),
+        (
+            lambda _: closed_loop(textbook.LinearSystem(num_controls=0), textbook.linear_policy, 0.1),
+            r"action noise needs controls, got a task of \(horizon, nu\) = \(4, 0\)",
+        ),
+    ],
+)
+def test_shapes_and_noise_that_do_not_fit_are_refused(key, call, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        call(key)

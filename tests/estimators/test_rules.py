@@ -36,10 +36,6 @@ def assert_decides(rule, facts: Evidence, alpha: float, reason, bias_bound: floa
     assert Reason[weights.reason] == Reason[reason]
 
 
-def test_inverse_variance_weighs_by_variances_alone():
-    assert_decides(rules.InverseVariance(), evidence(difference_norm=1e9), 0.8, Reason.inverse_variance, np.nan)
-
-
 def test_two_parts_without_variance_are_first_order():
     assert rules.InverseVariance()(evidence(first_variance=0.0, zeroth_variance=0.0)).alpha == 1
 
@@ -70,8 +66,17 @@ def test_the_concavity_test_is_the_published_inequality():
     assert Reason[weights.reason] == Reason[Reason.inconsistent]
 
 
-def test_consistent_derivatives_are_weighed_by_their_variance_until_a_bias_shows():
-    assert_decides(rules.Consistent(), evidence(), 0.8, Reason.inverse_variance, 0.8 * 0.05 * 2.0)
+@pytest.mark.parametrize(
+    ("rule", "changes", "alpha", "reason", "bound"),
+    [
+        (rules.InverseVariance(), {"difference_norm": 1e9}, 0.8, Reason.inverse_variance, np.nan),
+        (rules.Consistent(), {}, 0.8, Reason.inverse_variance, 0.8 * 0.05 * 2.0),
+        (rules.Consistent(threshold=0.1), {"inconsistency": 0.11}, 0.0, Reason.inconsistent, 0.0),
+        (rules.FixedAlpha(0.3), {}, 0.3, Reason.fixed, np.nan),
+    ],
+)
+def test_variances_weigh_unless_derivatives_contradict_costs_or_alpha_is_given(rule, changes, alpha, reason, bound):
+    assert_decides(rule, evidence(**changes), alpha, reason, bound)
 
 
 def test_a_difference_beyond_its_own_noise_counts_as_error_of_the_first_order():
@@ -81,14 +86,6 @@ def test_a_difference_beyond_its_own_noise_counts_as_error_of_the_first_order():
     weights = rules.Consistent()(evidence(difference_norm=1.5))
     np.testing.assert_allclose(weights.alpha, alpha, rtol=1e-6)
     assert Reason[weights.reason] == Reason[Reason.bias_limit]
-
-
-def test_derivatives_that_contradict_the_costs_are_not_used():
-    assert_decides(rules.Consistent(threshold=0.1), evidence(inconsistency=0.11), 0.0, Reason.inconsistent, 0.0)
-
-
-def test_a_given_alpha_is_taken():
-    assert_decides(rules.FixedAlpha(0.3), evidence(), 0.3, Reason.fixed, np.nan)
 
 
 @pytest.mark.parametrize("dim", [1, 5])

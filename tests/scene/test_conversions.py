@@ -154,26 +154,29 @@ def test_few_iterations_are_no_matter_where_nothing_is_solved():
     assert scene.mj_model.opt.iterations == 1
 
 
-def test_sleep_is_warned_about():
-    with pytest.warns(SceneWarning, match="flag sleep: disable instead of enable"):
-        load_scene(_ball(flag="<flag sleep='enable'/>"))
+_LIMITED = [
+    "<position kv='2' forcerange='-.1 .1' {}/>",
+    "<general gaintype='affine' gainprm='1 0 -2' ctrlrange='-.1 .1' ctrllimited='true' {}/>",
+    "<muscle lengthrange='-1 1' {}/>",
+]
+
+
+def _implicitfast(actuator):
+    rest = "<actuator>" + actuator.format("name='a' joint='j'") + "</actuator>"
+    return _pendulum(option="integrator='implicitfast'", rest=rest)
 
 
 @pytest.mark.parametrize(
-    "actuator",
-    ["<position kv='2' forcerange='-.1 .1' {}/>",
-     "<general gaintype='affine' gainprm='1 0 -2' ctrlrange='-.1 .1' ctrllimited='true' {}/>",
-     "<muscle lengthrange='-1 1' {}/>"],
-)  # fmt: skip
-def test_implicitfast_with_limited_actuators_is_warned_about(actuator):
-    rest = "<actuator>" + actuator.format("name='a' joint='j'") + "</actuator>"
-    with pytest.warns(SceneWarning, match="integrator at actuator 'a'.*derivative ignores"):
-        load_scene(_pendulum(option="integrator='implicitfast'", rest=rest))
-
-
-def test_implicitfast_with_a_free_body_is_warned_about():
-    with pytest.warns(SceneWarning, match="gyroscopic derivative"):
-        load_scene(BOX.format(option="integrator='implicitfast'"))
+    ("source", "said"),
+    [
+        (_ball(flag="<flag sleep='enable'/>"), "flag sleep: disable instead of enable"),
+        (BOX.format(option="integrator='implicitfast'"), "gyroscopic derivative"),
+        *((_implicitfast(actuator), "integrator at actuator 'a'.*derivative ignores") for actuator in _LIMITED),
+    ],
+)
+def test_what_moves_otherwise_is_warned_about(source, said):
+    with pytest.warns(SceneWarning, match=said):
+        load_scene(source)
 
 
 def _num_touching(scene):

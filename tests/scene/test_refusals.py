@@ -183,31 +183,28 @@ def test_contact_by_a_search_on_distance_fields_is_refused(kinds):
         load_scene(_pair(kinds), engine="mjx")
 
 
+_CAN = REFUSED["cylinder with box"][0]
+# MuJoCo lets bodies that a joint connects pass through each other.
+_HANGING = """<mujoco><worldbody><body><freejoint/><geom type="ellipsoid" size=".1 .2 .3"/>
+<body><joint/><geom type="cylinder" size=".1 .1"/></body></body></worldbody></mujoco>"""
+
+
 @pytest.mark.parametrize(
-    "how",
-    [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}],
+    "source",
+    [
+        _pair("cylinder ellipsoid", mask='contype="2"'),
+        _pair("cylinder ellipsoid", contact='<contact><exclude body1="p" body2="q"/></contact>'),
+        _HANGING,
+        _CAN.replace("></option>", "><flag contact='disable'/></option>"),
+    ],
 )
 @pytest.mark.filterwarnings("error")
-def test_of_what_cannot_touch_no_search_is_refused(how):
-    assert load_scene(_pair("cylinder ellipsoid", **how)).pairs == ()
-
-
-def test_a_cylinder_and_the_one_it_hangs_from_are_no_obstacle():
-    """MuJoCo lets bodies that a joint connects pass through each other."""
-    child = '<body><joint/><geom type="cylinder" size=".1 .1"/></body>'
-    body = f'<body><freejoint/><geom type="ellipsoid" size=".1 .2 .3"/>{child}</body>'
-    assert load_scene(f"<mujoco><worldbody>{body}</worldbody></mujoco>").pairs == ()
-
-
-def test_an_excluded_pair_is_no_obstacle():
-    source = REFUSED["cylinder with box"][0].replace("name='wall'", "name='wall' conaffinity='0'")
-    source = source.replace("name='wall'", "name='wall' contype='0'")
-    assert load_scene(source).mj_model.ngeom == 4
-
-
-def test_with_contact_disabled_no_pair_is_an_obstacle():
-    source = REFUSED["cylinder with box"][0].replace("></option>", "><flag contact='disable'/></option>")
+def test_what_cannot_touch_is_no_obstacle(source):
     assert load_scene(source).pairs == ()
+
+
+def test_a_geom_that_touches_nothing_is_no_obstacle():
+    assert load_scene(_CAN.replace("name='wall'", "name='wall' contype='0' conaffinity='0'")).mj_model.ngeom == 4
 
 
 def test_unused_settings_are_no_obstacle():
