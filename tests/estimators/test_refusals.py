@@ -141,7 +141,7 @@ def test_wrong_choices_are_answered_with_what_is_right(key, estimator, settings,
         ),
         *(
             (lambda _, x=x: parameter_noise(textbook.step, x), "stddev must be positive, got")
-            for x in (0, -0.1, np.nan)
+            for x in (0.0, -0.1, np.nan)
         ),
         (
             lambda _: parameter_noise(textbook.bumpy, jnp.array([0.1, 0.2]), dim=3),
