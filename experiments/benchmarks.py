@@ -6,12 +6,9 @@ Each in one process on the same work, compilation apart. Memory is what XLA sets
 
 - `mjx.step`: MJX as it is, its solver run to the same tolerance.
 - `mg.rollout`: our step, lean carry; on scenes with many contacts that could be, also with room for the nearest alone.
-- `mjx patched, value_and_grad`: MJX's solver loop replaced by a scan, since reverse mode refuses the loop: the usual way out.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
 - `mg.Discrete("mujoco")`: `mg.rollout` by C MuJoCo, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
 - `MuJoCo Warp`: its step, captured as a graph on a GPU; where warp-lang is installed (`pip install warp-lang`).
-
-With several batches it also draws the steps per second of the forward rows against them, runs/bench.png.
 
 With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
 
@@ -23,10 +20,8 @@ compiled program and once as ten programs, as ten runs of a script would make th
 """
 
 import copy
-import dataclasses
 import functools
 import importlib.util
-import itertools
 import platform
 import statistics
 import time
@@ -44,7 +39,6 @@ import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
-from experiments import theme
 from experiments.parallel import num_cores
 from mjxgrad._mjx import mjx
 from mjxgrad.tasks import scene_path
@@ -63,7 +57,6 @@ _ROOM = {"ant": 8, "quadruped": 8, "humanoid": 12}
 # Contacts of a state that MuJoCo Warp has room for.
 _WARP_ROOM = 64
 _TOLERANCE = 1e-6
-_PATCHED_ITERATIONS = 10
 
 # Of `costs`: from how high above contact a scene starts (m), as index in qpos and height; and how many steps it takes.
 _STARTS = {"two_bodies": (2, 0.02), "hopper": (1, 0.05)}
@@ -120,8 +113,6 @@ class Bench:
     """Runs of each; 0 compiles and reports memory, which may exceed the machine's."""
     forward: bool = False
     """Leave out all gradients."""
-    skip_patched: bool = False
-    """Leave out MJX's own gradient."""
     per_core: bool = False
     """Split every batch over one CPU device per core."""
 
@@ -155,59 +146,13 @@ def bench(*, options: Bench | None = None) -> None:
     if options.per_core:
         jax.config.update("jax_num_cpu_devices", num_cores())
     announce(f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]")
-    found: dict[str, dict[int, list[Row]]] = {}
     for name in options.scene:
         for batch in options.batch:
             print(f"\n{name}, batch {batch}")
-            rows = found.setdefault(name, {}).setdefault(batch, [])
+            base = None
             for row in _rows(name, batch, options):
-                rows.append(row)
-                _print(row, rows[0], batch * options.steps)
-    if len(options.batch) > 1 and options.runs:
-        _draw(found, options.steps)
-
-
-def _draw(found: dict[str, dict[int, list[Row]]], steps: int) -> None:
-    """Draw steps per second against batch, a panel for each scene, and last the time of the largest batch against rows."""
-    batches = list(next(iter(found.values())))
-    panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
-    for scene, by_batch in found.items():
-        num_rows = mg.load_scene(str(_SCENES[scene])).data._impl.efc_J.shape[0]
-        for batch, rows in by_batch.items():
-            for row in rows:
-                if "grad" not in row.name:
-                    kind = "mg.rollout, room for the nearest" if "contacts" in row.name else row.name
-                    panels.setdefault(scene, {}).setdefault(kind, []).append((batch, batch * steps / row.median))
-                    if batch == batches[-1]:
-                        last = panels.setdefault(f"batch {batch}", {}).setdefault(kind, [])
-                        last.append((num_rows, row.median / batch / steps * 1e6))
-    panels |= {last: panels.pop(last) for last in [f"batch {batches[-1]}"]}
-    columns = min(3, len(panels))
-    lines = -(-len(panels) // columns)
-    figure, axes = theme.subplots(lines, columns, height=3.4 * lines)
-    looks: dict[str, dict] = {}
-    for axis, (title, kinds) in itertools.zip_longest(axes.flat, panels.items(), fillvalue=("", {})):
-        axis.set_visible(bool(kinds))
-        axis.set(title=title, xscale="log", yscale="log", ylabel="steps per second", xlabel="batch")
-        axis.set_xticks(batches, batches, minor=False)
-        if title not in found:
-            axis.set(ylabel="µs per step", xlabel="rows of constraints")
-            axis.set_xticks(sorted({x for points in kinds.values() for x, _ in points}), minor=False)
-            theme.plain(axis.xaxis)
-        axis.minorticks_off()
-        for kind, points in kinds.items():
-            new = {
-                "color": (theme.FIRST, theme.ZEROTH, *theme.OTHERS)[len(looks)],
-                "marker": theme.MARKERS[len(looks)],
-                "label": kind,
-            }
-            axis.plot(*zip(*sorted(points), strict=True), **looks.setdefault(kind, new))
-    handles = {label: one for axis in axes.flat for one, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3)
-    path = Path("runs/bench.png")
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path)
-    print(f"\n{path}")
+                base = base or row
+                _print(row, base, batch * options.steps)
 
 
 def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
@@ -231,8 +176,6 @@ def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
         cases = {case: function for case, function in cases.items() if "grad" not in case}
     for case, function in cases.items():
         yield _time(case, mg.over_devices(function), states, options.runs)
-    if not options.skip_patched and not options.forward:
-        yield _patched(scene, states, options)
     if is_cpu and options.runs:
         yield _native(mj_model, states, options)
     if options.runs and importlib.util.find_spec("warp"):
@@ -264,30 +207,6 @@ def _mjx_outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int
     start = (data.qpos, data.qvel, data.act, data.qacc_warmstart)
     final, _ = jax.lax.scan(body, start, length=steps)
     return jnp.sum(final[0] ** 2) + jnp.sum(final[1] ** 2)
-
-
-def _patched(scene: mg.Scene, states: Any, options: Bench) -> Row:
-    """Measure MJX's own gradient with `while_loop` replaced by a scan that stops counting once it is done."""
-    model = scene.model.tree_replace({"opt.iterations": _PATCHED_ITERATIONS})
-    patched_scene = dataclasses.replace(scene, model=model)
-
-    def scan_loop(goes_on: Callable, body: Callable, start: Any) -> Any:
-        def turn(value: Any, _: None) -> tuple[Any, None]:
-            keep = goes_on(value)
-            moved = body(value)
-            return jax.tree.map(lambda new, old: jnp.where(keep, new, old), moved, value), None
-
-        first = jax.tree.map(jnp.asarray, start)
-        dtypes = jax.eval_shape(body, first)
-        first = jax.tree.map(lambda x, d: jnp.broadcast_to(x, d.shape).astype(d.dtype), first, dtypes)
-        return jax.lax.scan(turn, first, length=_PATCHED_ITERATIONS)[0]
-
-    original, jax.lax.while_loop = jax.lax.while_loop, scan_loop
-    try:
-        function = mg.over_devices(jax.value_and_grad(lambda s: _mjx_outcome(patched_scene, s, options.steps)))
-        return _time("mjx patched, value_and_grad", function, states, min(options.runs, 3))
-    finally:
-        jax.lax.while_loop = original
 
 
 def _time(name: str, function: Callable, states: Any, runs: int) -> Row:

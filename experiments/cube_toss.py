@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 from pydantic import Field
 
 import mjxgrad as mg
@@ -18,13 +18,12 @@ from experiments.config import ExperimentError
 from experiments.motion import advance, at_time_step
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
-from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, ZEROTH, Drawings, legend_below, power, subplots
+from experiments.theme import FIRST, MUTED, ONSET, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import capitalised, joined, percent, quantity
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.rollouts.integration import adaptive_rollout
 from mjxgrad.rollouts.state import data_of
-from mjxgrad.stepping import Contact, assembly
 from mjxgrad.tasks import scene_path
 
 
@@ -35,8 +34,6 @@ class Settings(RunSettings):
     """Of the cube with the floor: as DiffMJX published it, whose force begins continuously, or MuJoCo's default."""
     timesteps: Annotated[tuple[Positive, ...], Field(min_length=2)]
     """For discrete and slopes at MuJoCo's motion and contact that begins within the step, in s; each must divide a second."""
-    refined_timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    """For short steps at events, in s."""
     tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
     """Of the adaptive integration."""
 
@@ -86,7 +83,6 @@ METHODS = {
     "discrete": "discrete",
     "slope": "slope",
     "continuous": "contact that begins within the step",
-    "substeps": "event, short steps at events",
     "adaptive": "adaptive, differentiated",
     "quotient": "adaptive, difference quotient",
 }
@@ -94,7 +90,6 @@ _SHORT = {
     "discrete": "plain step",
     "slope": "slope at MuJoCo's motion",
     "continuous": "continuous onset",
-    "substeps": "event substeps",
     "adaptive": "adaptive steps",
     "quotient": "difference quotient",
 }
@@ -171,11 +166,10 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Take the derivative of every throw by every method."""
-    for timestep in (*settings.timesteps, *settings.refined_timesteps):
+    for timestep in settings.timesteps:
         if abs(DURATION / timestep - round(DURATION / timestep)) > 1e-6:
             raise ExperimentError(f"timesteps must divide {DURATION:g} s, got {timestep:g}")
     jobs = [(name, h) for name in ("discrete", "slope", "continuous") for h in settings.timesteps]
-    jobs += [("substeps", h) for h in settings.refined_timesteps]
     jobs += [(name, tolerance) for name in ("adaptive", "quotient") for tolerance in settings.tolerances]
     courses = []
     with workspace.stage("derivatives", "points", len(settings.contacts) * (1 + len(jobs))) as advance_to:
@@ -249,42 +243,10 @@ def _quotient(task: CubeToss, speed: Array, tolerance: Array) -> tuple[Array, Ar
     return (ends[1] - ends[0]) / (2 * _STEP), jnp.sum(num_steps).astype(float), jnp.any(failed)
 
 
-def substepped_step(
-    model: mjx.Model, data: mjx.Data, *, num_substeps: int = 8, contact: Contact = mg.Discrete()
-) -> mjx.Data:
-    """Advance by one time step, in short steps if a contact or limit begins or ends in it: if a distance changes its sign."""
-    after = mg.step(model, data, contact=contact)
-    short = at_time_step(model, model.opt.timestep / num_substeps)
-
-    def refine(data: mjx.Data) -> mjx.Data:
-        def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            return mg.step(short, data, contact=contact), None
-
-        return jax.lax.scan(substep, data, length=num_substeps)[0]
-
-    return jax.lax.cond(_holds_event(model, data, after), refine, lambda _: after, data)
-
-
-def _holds_event(model: mjx.Model, before: mjx.Data, after: mjx.Data) -> Bool[Array, ""]:
-    """Whether some distance changes its sign, judged by distances at the step's beginning and velocities at its end."""
-    # Contacts and kinematics of a stepped data are those of the state before; its position is not.
-    found = jnp.zeros((), bool)
-    for block in assembly.gather(model, after.replace(qpos=before.qpos)):
-        if block.rows_each:
-            distance, rates = (
-                block.residual[:: block.rows_each],
-                block.map.mv(after.qvel).reshape(-1, block.rows_each),
-            )
-            rate = jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
-            found |= jnp.any((distance < 0) != (distance + model.opt.timestep * rate < 0))
-    return found
-
-
 _DERIVATIVES: dict[str, Derivative] = {
     "discrete": functools.partial(_by_steps, functools.partial(mg.step, contact=mg.Discrete())),
     "slope": functools.partial(_by_steps, functools.partial(mg.step, contact=mg.Slope())),
     "continuous": functools.partial(_by_steps, functools.partial(mg.step, contact=mg.Onset())),
-    "substeps": functools.partial(_by_steps, functools.partial(substepped_step, contact=mg.Slope())),
     "adaptive": _adaptive,
     "quotient": _quotient,
 }
@@ -379,7 +341,7 @@ def tables(outcome: Outcome) -> list[Table]:
     caption = (
         "Error: root mean square over throws, of a single derivative, as a share of the derivative; bias: its mean. "
         "Reference: difference quotient of adaptive rollouts at tolerance 1e-10. The first call takes all throws and "
-        "compiles, unless an earlier setting did or it was cached. Short steps at events are not counted. In bold the "
+        "compiles, unless an earlier setting did or it was cached. In bold the "
         f"fastest whose method stays below {TARGET:.0%} from there on."
     )
     return [Table(columns, rows, caption, frozenset(emphasised))]
@@ -393,7 +355,6 @@ _LOOKS = {
     "discrete": {"color": FIRST, "marker": "o"},
     "slope": {"color": ZEROTH, "marker": "s"},
     "continuous": {"color": ONSET, "marker": "D"},
-    "substeps": {"color": DEFAULT, "marker": "^"},
     "adaptive": {"color": "#e69f00", "marker": "v"},
     "quotient": {"color": "#56b4e9", "marker": "P"},
 }
@@ -403,7 +364,7 @@ DIFFMJX = (("Euler 1 ms", 17.77, 3.29), ("Euler 30 µs", 0.0277, 102.5), ("Bosh3
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    return {"error": error, "bias": bias}
+    return {"error": error}
 
 
 def error(outcome: Outcome):
@@ -430,29 +391,6 @@ def error(outcome: Outcome):
         "verdict asks for."
     )
     return _finished(figure, axes[0], outcome), "Error against time", caption
-
-
-def bias(outcome: Outcome):
-    """Mean and single errors of the methods of fixed step against the step."""
-    figure, axes = subplots(1, len(outcome.courses), height=4.0, sharey=True)
-    for axis, course in zip(axes[0], outcome.courses, strict=True):
-        axis.axhline(0, color=MUTED, lw=0.8)
-        for method in ("discrete", "slope", "continuous", "substeps"):
-            points = _finite(course, method)
-            steps, errors = [point.setting for point in points], np.array([course.errors(point) for point in points])
-            axis.plot(steps, errors, color=_LOOKS[method]["color"], lw=0.5, alpha=0.5)
-            axis.plot(steps, errors.mean(axis=1), ms=5, label=METHODS[method], **_LOOKS[method])
-        axis.set(xscale="log", xlabel="time step, s")
-        axis.set_yscale("symlog", linthresh=0.01)
-        ticks = [point.setting for point in course.of("discrete")]
-        axis.set_xticks(ticks, [power(tick) for tick in ticks])
-        axis.minorticks_off()
-    axes[0, 0].set_ylabel("error of the derivative, relative")
-    caption = (
-        "Mean error over the throws (thick), and single throws (thin). A mean over four throws is what noise on the throw "
-        "would leave. Errors within ±1 % are drawn to scale, larger ones by their logarithm."
-    )
-    return _finished(figure, axes[0], outcome), "Bias and spread", caption
 
 
 def _finite(course: Course, method: str) -> list[Point]:

@@ -21,7 +21,6 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
 import cyclopts
@@ -203,17 +202,6 @@ def _print(case: tuple[int, int], row: Row) -> None:
     print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 
-def verdict(rows: Mapping[tuple[int, int], Row]) -> str:
-    """Say in one line where ours is faster by medians, and how far the values are apart."""
-    parts = []
-    for name, key in {"search alone": "search", "called again": "again", "with compiling": "first"}.items():
-        ratios = {case: statistics.median(x.theirs) / statistics.median(getattr(x, key)) for case, x in rows.items()}
-        won = [f"{p} × {w} ({ratio:.2g} times)" for (p, w), ratio in ratios.items() if ratio > 1]
-        parts.append(f"{name} at {', '.join(won) or 'none'}")
-    apart = max(row.apart[0] for row in rows.values())
-    return f"Ours is faster, {'; '.join(parts)}; theirs elsewhere. Values differ by at most {apart:.0e} of an interval."
-
-
 _Many = cyclopts.Parameter(consume_multiple=True, negative="")
 
 
@@ -224,7 +212,7 @@ def identify(
     runs: int = 5,
     limit: float = 120,
 ) -> None:
-    """Measure identification against mujoco.sysid: the table, and where ours is faster.
+    """Measure identification against mujoco.sysid.
 
     Args:
         parameters: how many are unknown, case by case.
@@ -241,7 +229,6 @@ def identify(
         f"theirs: {_THEIRS}\nours: {_OURS}, ends when 1e-3 of a standard error is left to go\n"
         f"seconds are the median of the runs (and the least), differences the largest\n\n{_HEAD}"
     )
-    rows = {}
     for case in itertools.product(parameters, windows):
         # Nothing of one problem helps the next to compile, or is searched for garbage while theirs runs.
         jax.clear_caches()
@@ -249,6 +236,5 @@ def identify(
         with tempfile.TemporaryDirectory() as empty:
             jax.config.update("jax_compilation_cache_dir", empty)
             compilation_cache.reset_cache()
-            rows[case] = compare(problem(*case), runs, limit)
-        _print(case, rows[case])
-    print(f"\n{verdict(rows)}")
+            row = compare(problem(*case), runs, limit)
+        _print(case, row)

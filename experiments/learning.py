@@ -398,15 +398,6 @@ def findings(outcome: Outcome) -> list[str]:
             speed, turning = (quantity(off.mean(), _spread(off)) for off in _off_command(course))
             each.append(f"{_label(course, outcome)} {speed} m/s and {turning} rad/s")
         sentences.append(f"Off the command, root mean squares in C MuJoCo, pushes included: {'; '.join(each)}.")
-    measured = [course for course in outcome.courses if course.method != "ppo"]
-    if not measured:
-        return sentences
-    ratio = [float(np.median(c.history["zeroth_variance"] / c.history["first_variance"])) for c in measured]
-    span = joined(dict.fromkeys((quantity(min(ratio)), quantity(max(ratio)))), "to")
-    sentences.append(
-        f"The variance of the zeroth-order gradient is {span} times that of the first order, by actions, in the median over "
-        "updates."
-    )
     return sentences
 
 

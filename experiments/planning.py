@@ -30,8 +30,6 @@ from mjxgrad.stepping import Smoothing
 Count = Annotated[int, Field(ge=1)]
 NAMES = {
     "analytic": "analytic",
-    "mean_jacobian": "mean Jacobians",
-    "least_squares": "least squares",
     "none": "no smoothing",
 }
 
@@ -39,9 +37,7 @@ NAMES = {
 class Settings(RunSettings):
     """A rod is pushed to a pose by a finger that does not touch it at the start."""
 
-    models: Annotated[
-        tuple[Literal["analytic", "mean_jacobian", "least_squares", "none"], ...], Field(min_length=1)
-    ] = ("analytic", "none")
+    models: Annotated[tuple[Literal["analytic", "none"], ...], Field(min_length=1)] = ("analytic", "none")
     """The linear models to compare; figures and video show the first."""
     finger: tuple[Finite, Finite] = (0.0, -0.15)
     """The finger's start (m)."""
@@ -51,8 +47,6 @@ class Settings(RunSettings):
     """Smoothing of contacts at the start (m)."""
     last_length: Positive = 0.001
     """Smoothing of contacts in the last iterations (m)."""
-    num_samples: Annotated[int, Field(ge=14)] = 24
-    """Samples per linear model, where it is sampled."""
     num_iterations: Annotated[int, Field(ge=3)] = 60
     """Iterations of trajectory optimisation."""
     horizon: Count = 25
@@ -160,18 +154,6 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     return Outcome(settings, attempts, np.asarray(trajectory.qpos), float(system.scene.model.opt.timestep))
 
 
-def _smoother(model: str, settings: Settings) -> Smoother:
-    """Return the linear models; sampled ones have noise of the same length on positions, less on velocities."""
-    length = settings.length
-    if model == "none":
-        return mg.planning.Exact()
-    if model == "analytic":
-        return mg.planning.Analytic(Smoothing(length))
-    rod_turn = length / 0.1  # as far at the rod's end
-    state = jnp.array([length] * 4 + [rod_turn] + [0.1 * length] * 5)
-    return mg.planning.Sampled(state, length, settings.num_samples, "first" if model == "mean_jacobian" else "zeroth")
-
-
 @eqx.filter_jit
 def _optimised(task: PlanarPusher, settings: Settings, smoother: Smoother, schedule: np.ndarray) -> Plan:
     limit, weight = task.speed_limit, jnp.array(_ROD)
@@ -193,8 +175,9 @@ def _attempt(task: PlanarPusher, settings: Settings, model: str) -> Attempt:
     count, last = settings.num_iterations, settings.last_length / settings.length
     still = count // 6
     factors = np.concatenate([np.ones(still), np.geomspace(1, last, count - 2 * still), np.full(still, last)])
+    smoother = mg.planning.Analytic(Smoothing(settings.length)) if model == "analytic" else mg.planning.Exact()
     begin = time.perf_counter()
-    plan = _optimised(task, settings, _smoother(model, settings), factors)
+    plan = _optimised(task, settings, smoother, factors)
     seconds, rows = time.perf_counter() - begin, plan.iterations
     course = {
         "length": settings.length * np.asarray(rows.factor),
@@ -251,7 +234,7 @@ def tables(outcome: Outcome) -> list[Table]:
     return [Table(columns, rows, caption)]
 
 
-_COLOURS = {"analytic": ZEROTH, "mean_jacobian": FIRST, "least_squares": "#009e73", "none": DEFAULT}
+_COLOURS = {"analytic": ZEROTH, "none": DEFAULT}
 _HALF_LENGTH, _RADIUS = 0.1, 0.02  # m, of the rod's axis; of rod and finger
 _EVERY = 3  # decisions between the poses drawn
 _DECISION = 0.1  # s

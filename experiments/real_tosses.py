@@ -69,9 +69,7 @@ class Settings(RunSettings):
 HALF_SIDE = 0.0524  # m
 SIDE = 2 * HALF_SIDE
 RATE = 148.0  # Hz
-GRAVITY = 9.81  # m/s²
 _MASS, _INERTIA = 0.37, 8.1e-4  # kg, kg m²
-NUM_TOSSES = 570
 _SHARP = 1e-4  # m, radius of a corner that is none
 # With MuJoCo's default contact, solref = (0.02, 1), written as stiffness and damping ratio.
 NOMINAL = {"side": SIDE, "radius": _SHARP, "friction": 0.18, "stiffness": (0.95 * 0.02) ** -2, "damping_ratio": 1.0}
@@ -207,16 +205,6 @@ def lowest(qpos: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, " rows"]:
     return qpos[:, 2] - HALF_SIDE * np.abs(up).sum(axis=1)
 
 
-def fall(tosses: list[Toss]) -> tuple[float, float]:
-    """Measure how fast the recorded cube falls before it touches, in m/s²: the mean over tosses and its standard error."""
-    found = []
-    for toss in tosses:
-        count = int(np.argmax(np.append(lowest(toss.qpos) < 0.01, True)))
-        if count >= 10:
-            found.append(-2 * np.polyfit(np.arange(count) / RATE, toss.qpos[:count, 2], 2)[0])
-    return float(np.mean(found)), float(np.std(found, ddof=1) / np.sqrt(len(found)))
-
-
 def replay(model: mujoco.MjModel, toss: Toss, substeps: int) -> Float[np.ndarray, "rows 7"]:
     """Roll out a toss from its first state in C MuJoCo."""
     data = mujoco.MjData(model)
@@ -278,7 +266,6 @@ class Outcome:
     judged: dict[str, Float[np.ndarray, "tosses 4"]]
     shown: Toss  # of those held out, one whose error is in the middle
     courses: dict[str, Float[np.ndarray, "rows 7"]]  # of it
-    fall: tuple[float, float]  # m/s², and its standard error
     num_windows: int
 
     def rows(self) -> list[dict[str, Any]]:
@@ -322,7 +309,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         judged[name] = np.array([_judge(*pair) for pair in zip(courses[name], held_out, strict=True)])
     middle = int(np.argsort(judged[BEST][:, 0])[len(held_out) // 2])
     shown = {name: course[middle] for name, course in courses.items()}
-    return Outcome(settings, fits, judged, held_out[middle], shown, fall(tosses), len(windows))
+    return Outcome(settings, fits, judged, held_out[middle], shown, len(windows))
 
 
 def _judge(course: Float[np.ndarray, "rows 7"], toss: Toss) -> tuple[float, ...]:
@@ -383,21 +370,6 @@ def verdict(outcome: Outcome) -> str:
         f"Mean error over {outcome.settings.num_held_out} whole tosses: {held}. "
         f"Residuals follow one another (correlation {best.correlation:.2f}): they are error of the model, which intervals lack."
     )
-
-
-def findings(outcome: Outcome) -> list[str]:
-    """Say how near the side comes by each way, what the fall says of lengths, and what the derivative without onset does."""
-    fall, error = outcome.fall
-    corrected = outcome.fits[BEST].values["side"] * GRAVITY / fall / SIDE - 1
-    sides = joined(f"{_signed(off(fit))} ({name})" for name, fit in outcome.fits.items())
-    without, best = outcome.fits["rounded corners, no onset"], outcome.fits[BEST]
-    return [
-        f"The side is off the published {1e3 * SIDE:.1f} mm by {sides}; DiffMJX reports about {BAND:.0%}.",
-        f"Recorded cubes fall with {quantity(fall, error)} m/s². If their lengths are too short by that share of "
-        f"{GRAVITY:g}, the side with rounded corners is off by {_signed(corrected)}; a slow clock would explain the fall, too.",
-        f"Without onset the search ends at residuals of {without.rms[1]:.2f} ({without.stopped}), with it at "
-        f"{best.rms[1]:.2f} ({best.stopped}).",
-    ]
 
 
 def warnings(outcome: Outcome) -> list[str]:

@@ -16,42 +16,18 @@ from pydantic import Field, model_validator
 from scipy import stats
 
 from experiments import theme
-from experiments.config import ExperimentError, suggest
-from experiments.problems import estimators as library
+from experiments.optimisation.settings import MethodSettings
 from experiments.problems import textbook
-from experiments.problems.comparison import Comparison, Rollouts, compare
+from experiments.problems.comparison import Comparison, compare
+from experiments.problems.estimators import estimator
 from experiments.problems.textbook import Textbook
 from experiments.report import Table
-from experiments.settings import Finite, Positive, RunSettings, SettingsTable
+from experiments.settings import Finite, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
-from mjxgrad.estimators import rules
 
 Count = Annotated[int, Field(ge=2)]
-
-
-class EstimatorSettings(SettingsTable):
-    """One estimator, with what is set of its options."""
-
-    name: str
-    """Of a function in `mjxgrad.estimators`."""
-    baseline: Literal["leave_one_out", "zero_noise", "none"] | None = None
-    """Of the zeroth-order part; the estimator's own default if it is not set."""
-    antithetic: bool | None = None
-    """Whether noise is used in pairs."""
-    rule: Literal["consistent", "inverse_variance", "concavity"] | None = None
-    """How alpha_order chooses its weight; the rules that need no number of the user."""
-
-    @property
-    def label(self) -> str:
-        """Give a name for legends and tables."""
-        parts = []
-        if self.baseline is not None:
-            parts.append(self.baseline.replace("_", " ") if self.baseline != "none" else "no baseline")
-        parts += ["pairs"] if self.antithetic else []
-        parts += [self.rule.replace("_", " ")] if self.rule else []
-        return self.name.replace("_", " ").replace("alpha ", "α-") + (f" ({', '.join(parts)})" if parts else "")
 
 
 class Settings(RunSettings):
@@ -63,7 +39,7 @@ class Settings(RunSettings):
     """Where the gradient is estimated."""
     stddev: Positive
     """Of the noise."""
-    estimators: Annotated[tuple[EstimatorSettings, ...], Field(min_length=1, max_length=10)]
+    estimators: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
     """In the order of the legend."""
     num_samples: Annotated[tuple[Count, ...], Field(min_length=2)]
     """Rollouts per estimate, all that an estimator spends included, for error against rollouts."""
@@ -86,13 +62,14 @@ class Settings(RunSettings):
             raise ValueError("stiffness and shown_stiffness must not be set: a step has none; take soft_heaviside")
         if self.problem != "heaviside" and (len(self.stiffness) < 2 or self.shown_stiffness is None):
             raise ValueError(f"{self.problem} needs at least two values of stiffness, and shown_stiffness")
-        labels = [estimator.label for estimator in self.estimators]
+        if other := [one.label for one in self.estimators if one.is_search or one.name == "reinforce"]:
+            raise ValueError(f"estimators must be of one gradient with noise on the parameters, got {other[0]}")
+        if any(one.rule == "bias_constrained" for one in self.estimators):
+            raise ValueError("estimators must have rules that need no number, got bias_constrained")
+        labels = [one.label for one in self.estimators]
         if repeated := {label for label in labels if labels.count(label) > 1}:
             raise ValueError(f"estimators must differ, got {', '.join(sorted(repeated))} more than once")
         return self
-
-
-_RULES = {"consistent": rules.Consistent, "inverse_variance": rules.InverseVariance, "concavity": rules.Concavity}
 
 
 @dataclass(frozen=True)
@@ -129,7 +106,7 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Repeat every estimator at every number of rollouts and every stiffness."""
-    named = {one.label: _estimator(one) for one in settings.estimators}
+    named = {one.label: estimator(one) for one in settings.estimators}
     shown = settings.shown_stiffness
     problem = _problem(settings, shown)
     samples_key, stiffness_key = jax.random.split(jax.random.key(settings.seed))
@@ -144,8 +121,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 problem.objective(settings.stddev),
                 jnp.array([settings.point]),
                 jax.random.fold_in(key, i),
-                budget=Rollouts(rollouts),
-                reference=np.asarray(problem.gradient(settings.point, settings.stddev)),
+                budget=rollouts,
+                reference=np.reshape(problem.gradient(settings.point, settings.stddev), 1),
                 num_repeats=settings.num_repeats,
                 confidence=settings.confidence,
             )
@@ -166,26 +143,14 @@ def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tabl
     dims, stiffness = ("setting", "estimator"), [np.nan if one is None else one for one, _ in cells]
     labels = [one.label for one in settings.estimators]
     data = xr.Dataset(coords={"estimator": labels, "stiffness": ("setting", stiffness)})
-    one_each = ("num_samples", "num_rollouts", "num_gradient_rollouts", "num_finite", "claimed_variance")
-    for name in (*one_each, "mean", "bias", "rmse", "variance"):
+    one_each = ("num_samples", "num_rollouts", "num_finite", "claimed_variance", "variance")
+    for name in (*one_each, "mean", "bias", "rmse"):
         data[name] = dims, np.stack([getattr(table, name).reshape(len(labels)) for table in tables])
-    for name in ("bias", "rmse", "variance"):
+    for name in ("bias", "rmse"):
         ends = np.stack([getattr(table, f"{name}_interval").reshape(2, len(labels)) for table in tables], axis=1)
         data[f"{name}_low"], data[f"{name}_high"] = (dims, ends[0]), (dims, ends[1])
-    data["variance_method"] = dims, [table.variance_methods for table in tables]
     exact = [[_exact_error(one, settings, *cell) for one in settings.estimators] for cell in cells]
     return data.assign(exact_rmse=(dims, exact))
-
-
-def _estimator(settings: EstimatorSettings) -> functools.partial:
-    # Those that give one estimate of parameters with noise on them.
-    names = [name for name in library.__all__ if name != "reinforce"]
-    if settings.name not in names:
-        raise ExperimentError(f'there is no estimator "{settings.name}"; {suggest(settings.name, names)}')
-    options = settings.model_dump(exclude={"name"}, exclude_none=True)
-    if settings.rule is not None:
-        options["rule"] = _RULES[settings.rule]()
-    return functools.partial(getattr(library, settings.name), **options)
 
 
 def _problem(settings: Settings, stiffness: float | None) -> Textbook:
@@ -196,7 +161,7 @@ def _problem(settings: Settings, stiffness: float | None) -> Textbook:
     return textbook.quadratic_sine(settings.amplitude, stiffness)
 
 
-def _exact_error(one: EstimatorSettings, settings: Settings, stiffness: float | None, rollouts: int) -> float:
+def _exact_error(one: MethodSettings, settings: Settings, stiffness: float | None, rollouts: int) -> float:
     """Give the root-mean-square error of an estimator in closed form; NaN where there is none."""
     point, stddev, problem = settings.point, settings.stddev, _problem(settings, stiffness)
     if one.antithetic or one.name not in ("first_order", "zeroth_order"):

@@ -214,7 +214,7 @@ def identify(
     Args:
         scene: an MJCF file.
         recordings: CSV or NPZ files, before the options.
-        parameter: kind:name or kind:name=low..high. Kinds are mass (bodies), friction, stiffness, damping_ratio,
+        parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
             (actuators) and delay. kind:one,other is one value for both.
         held_out: share for validation only: every n-th recording, or the end of a single one.

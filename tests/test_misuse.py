@@ -101,6 +101,7 @@ FOUND = {
     "mg.load_scene('')": "got ''",
     "mg.load_scene('<mujoco/>', softness=1e4)": "softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got 10000.0",
     "mg.rollout(scene, state, horizon=2, contact='slope')": 'mg.Onset() or mg.Smoothing(), got "slope"',
+    "mg.Softness(geoms='ball')": "geoms must be a tuple of names, got 'ball'; write ('ball',)",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",

@@ -9,7 +9,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.ticker import NullLocator, SymmetricalLogLocator
-from numpy.typing import ArrayLike
 
 from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
@@ -90,7 +89,7 @@ def _bias_seen(swept: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
 def verdict(outcome: Outcome) -> str:
     """Say where each estimate is to be used."""
     choice = f"With {outcome.settings.rollouts_per_gradient} rollouts per gradient {_choice(outcome.swept, _words(outcome))}."
-    return " ".join([choice, _bias(outcome), *_default(outcome)])
+    return " ".join([choice, *_default(outcome)])
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -154,37 +153,15 @@ def _angles(angles: xr.DataArray, words: Words) -> str:
     return f"at {joined(f'{angle:g}' for angle in angles.values)}{words.at}"
 
 
-def _range(stiffness: xr.DataArray, rows: ArrayLike, words: Words) -> str:
-    """Words for the stiffnesses of some rows of the sweep: a range if they are neighbours, else a list."""
-    picked = np.flatnonzero(np.asarray(rows))
-    labels = [power(k) for k in stiffness.values[picked]]
-    is_range = len(picked) > 2 and (np.diff(picked) == 1).all()
-    ends = f"from {words.lead}{labels[0]} to {labels[-1]}{words.per}"
-    return ends if is_range else f"at {words.lead}{joined(labels)}{words.per}"
-
-
-def _bias(outcome: Outcome) -> str:
-    swept, words = outcome.swept, _words(outcome)
-    biased, is_blind = _bias_seen(swept)
-    if not biased.any():
-        return f"No bias of the first-order estimate is seen in the sweep ({outcome.settings.confidence:.0%} over all cases)."
-    parts = [f"The first-order estimate is measurably biased {_range(swept.stiffness, biased, words)}"]
-    if is_blind.any():
-        parts.append(f"{_range(swept.stiffness, is_blind, words)} it is too noisy to tell")
-    if (is_clean := ~biased & ~is_blind).any():
-        parts.append(f"{_range(swept.stiffness, is_clean, words)} no bias is seen")
-    return "; ".join(parts) + "."
-
-
 def _default(outcome: Outcome) -> list[str]:
     default = outcome.table.isel(stiffness=outcome.table.is_default.values)
     if not default.stiffness.size:
         return []
     biased, wrong, count = int(default.is_biased.sum()), int(default.has_wrong_sign.sum()), default.angle.size
     if not biased:
-        return [f"Under {_own(outcome)} no bias is seen at any of the {count} {_words(outcome).place}s."]
+        return [f"Under {_own(outcome)} no bias of first order is seen at any of the {count} {_words(outcome).place}s."]
     sign = f", and has the wrong sign at {wrong}" if wrong else ""
-    return [f"Under {_own(outcome)} it is biased at {biased} of {count} {_words(outcome).place}s{sign}."]
+    return [f"Under {_own(outcome)} first order is biased at {biased} of {count} {_words(outcome).place}s{sign}."]
 
 
 def _own(outcome: Outcome) -> str:

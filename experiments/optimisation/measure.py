@@ -18,12 +18,12 @@ from experiments.motion import own_task
 from experiments.optimisation import searches
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.problems import estimators, published_scenes
-from experiments.problems.comparison import Comparison, Rollouts, affordable, bias_interval, compare
+from experiments.problems.comparison import affordable, bias_interval
+from experiments.problems.estimators import estimator
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import mean_interval
-from mjxgrad.estimators import GradientEstimate, Reason, rules
+from mjxgrad.estimators import Reason
 
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
 ROUNDING = 1e-6
@@ -146,7 +146,6 @@ class Outcome:
     # Published mean and standard deviation of the final cost, by what they belong to.
     reference: dict[str, tuple[float, float]]
     runs: list[Run]  # in the order of the settings
-    errors: Comparison | None  # of one estimate at the start, of the methods that estimate; None if it was not measured
 
     @functools.cached_property
     def verdicts(self) -> list[Difference]:
@@ -173,20 +172,11 @@ class Outcome:
             return None
         return self.reference.get({"bias_constrained": "alpha", "concavity": "ddcg"}.get(method.rule or "", ""))
 
-    def relative_error(self, run: Run) -> Float[np.ndarray, " 3"] | None:
-        """Give the error of one estimate at the start over the gradient's norm, with its interval."""
-        if self.errors is None or run.method.label not in self.errors.names:
-            return None
-        row = self.errors.names.index(run.method.label)
-        ends = self.errors.rmse_interval[:, row]
-        return np.array([self.errors.rmse[row], *ends]) / np.linalg.norm(self.errors.reference)
-
     def rows(self) -> list[dict[str, Any]]:
         """One row per method, seed and evaluation, for metrics.csv."""
         return [
             {
                 "task": self.settings.scene or self.settings.task,
-                "dynamics": self.settings.dynamics,
                 "method": run.method.label,
                 "seed": seed,
                 "rollouts": int(run.rollouts[i]),
@@ -201,26 +191,8 @@ class Outcome:
         ]
 
 
-_SCENES = {
-    "push_soft": lambda: published_scenes.push(10.0),
-    "push_stiff": lambda: published_scenes.push(1000.0),
-    "friction": published_scenes.friction,
-    "motion_planning": published_scenes.motion_planning,
-    "tennis": published_scenes.tennis,
-}
 _OWN = {"num_samples": 16, "learning_rate": 1.0, "num_steps": 100, "gamma": 1.0, "bound": 1.0}
 _ELITE = 0.2  # share of the candidates that cross-entropy fits to
-# How to optimise the scenes; found by trying, so that few steps show what each is about.
-_PUSH = {"num_samples": 10, "learning_rate": 1e-3, "num_steps": 200, "gamma": 1e8, "bound": 100.0}
-_SCENE_SETTINGS = {
-    "push_soft": _PUSH,
-    "push_stiff": _PUSH,
-    "friction": {"num_samples": 10, "learning_rate": 1e-4, "num_steps": 100, "gamma": 2e4, "bound": 100.0},
-    "motion_planning": {"num_samples": 50, "learning_rate": 0.03, "num_steps": 100, "gamma": 150.0, "bound": 10.0},
-    "tennis": {
-        "num_samples": 100, "learning_rate": 1e-6, "num_steps": 60, "gamma": 1000.0, "bound": 1000.0, "num_starts": 500
-    },
-}  # fmt: skip
 
 
 def problem(settings: Settings) -> Published:
@@ -232,34 +204,10 @@ def problem(settings: Settings) -> Published:
         objective = mg.open_loop(task, settings.stddev * jnp.asarray(half_range(task.scene)))
         start = jnp.tile(task.scene.data.ctrl, task.horizon)
         found = Published(objective, start, reference={}, **_OWN)
-    elif settings.dynamics == "published":
-        found = TASKS[str(settings.task)]()
     else:
-        task = _SCENES[str(settings.task)]()
-        # What is published of the equations does not hold for the scene.
-        found = Published(task.objective(), task.initial_params(), reference={}, **_SCENE_SETTINGS[str(settings.task)])
+        found = TASKS[str(settings.task)]()
     chosen = settings.model_dump(include={"num_steps", "num_samples", "learning_rate"}, exclude_none=True)
     return replace(found, **chosen, reference={}) if chosen else found
-
-
-def scene(settings: Settings) -> mg.Scene | None:
-    """Give the scene of the task; None under the published equations, which have none."""
-    if settings.scene is not None:
-        return own_task(settings).scene
-    return None if settings.dynamics == "published" else _SCENES[str(settings.task)]().scene
-
-
-def estimator(method: MethodSettings, task: Published) -> Callable[..., GradientEstimate]:
-    """Give a function of `mjxgrad.estimators`, its options bound; its rule may take the published constants of the task."""
-    options = method.options
-    if method.rule is not None:
-        options["rule"] = {
-            "consistent": rules.Consistent,
-            "inverse_variance": rules.InverseVariance,
-            "concavity": rules.Concavity,
-            "bias_constrained": lambda: rules.BiasConstrained(task.gamma, task.bound),
-        }[method.rule]()
-    return functools.partial(getattr(estimators, method.name), **options)
 
 
 def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Callable[..., mg.Optimisation]:
@@ -269,8 +217,8 @@ def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Call
     """
     if method.is_search:
         return _search(method, task)
-    function = estimator(method, task)
-    afforded = affordable(function, task.objective, task.params, key, Rollouts(task.num_samples)).num_samples
+    function = estimator(method, task.gamma, task.bound)
+    afforded = affordable(function, task.objective, task.params, key, task.num_samples)
 
     def run(keys: Key[Array, " seeds"], **options: Any) -> mg.Optimisation:
         return mg.optimise(
@@ -299,21 +247,18 @@ def _search(method: MethodSettings, task: Published) -> Callable[..., mg.Optimis
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Run every method from every seed, and estimate the gradient at the start many times."""
+    """Run every method from every seed."""
     task = problem(settings)
-    if (simulated := scene(settings)) is not None:
-        workspace.check(simulated)
-    run_key, error_key = jax.random.split(jax.random.key(settings.seed))
+    if settings.scene is not None:
+        workspace.check(own_task(settings).scene)
+    key = jax.random.key(settings.seed)
     runs = []
     with workspace.stage("optimisation", "methods", len(settings.methods)) as advance_to:
         for i, method in enumerate(settings.methods):
             # Other noise for every method: the tests of their differences take runs to be independent.
-            run = functools.partial(_run, method, task, settings, jax.random.fold_in(run_key, i))
+            run = functools.partial(_run, method, task, settings, jax.random.fold_in(key, i))
             runs.append(workspace.once(f"{i}", run))
             advance_to(len(runs))
-    errors = None
-    if settings.error_repeats > 1:
-        errors = workspace.once("errors", lambda: _errors(task, settings, error_key, workspace))
     return Outcome(
         settings=settings,
         num_samples=task.num_samples,
@@ -322,7 +267,6 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         start_cost=float(jax.jit(task.final_cost)(task.params)),
         reference=dict(task.reference),
         runs=runs,
-        errors=errors,
     )
 
 
@@ -362,29 +306,3 @@ def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     names = ["fixed", "inverse_variance", "bias_limit", "uncertain", "inconsistent", "not_finite", "nothing_felt"]
     found = {name: np.asarray(history.reason == getattr(Reason, name)) & was_done for name in names}
     return {name: where for name, where in found.items() if where.any()}
-
-
-def _errors(task: Published, settings: Settings, key: jax.Array, workspace: Workspace) -> Comparison | None:
-    named = {one.label: estimator(one, task) for one in settings.methods if not one.is_search}
-    if not named:
-        return None
-    reference_key, repeats_key = jax.random.split(key)
-    with workspace.stage("errors of one estimate", "estimators", 1 + len(named)) as advance_to:
-        # Unbiased, and never much worse than zeroth order.
-        reference = jax.jit(
-            lambda at: mg.estimators.control_variate(
-                task.objective, at, reference_key, num_samples=settings.reference_samples
-            )
-        )(task.params)
-        advance_to(1)
-        return compare(
-            named,
-            task.objective,
-            jnp.asarray(task.params),
-            repeats_key,
-            budget=Rollouts(task.num_samples),
-            reference=(np.asarray(reference.value), np.asarray(reference.standard_error)),
-            num_repeats=settings.error_repeats,
-            confidence=settings.confidence,
-            progress=lambda done, _: advance_to(1 + done),
-        )

@@ -15,8 +15,6 @@ from experiments.words import capitalised, percent, quantity
 
 # A column in the page over a sweep.
 _AGAINST = "α-order against the better"
-# A published standard deviation is of 2 to 5 seeds; within three of both there is no telling them apart.
-_AGREEMENT = 3.0
 
 
 def answer(outcome: Outcome) -> str:
@@ -42,21 +40,6 @@ def verdict(outcome: Outcome) -> str:
     best = outcome.best
     lowest = f"Lowest of all ends {best.method.label}, at {quantity(best.mean, best.spread)}."
     return " ".join([*map(_comparison, outcome.verdicts), lowest])
-
-
-def findings(outcome: Outcome) -> list[str]:
-    """Compare with what was published, within the spreads of both."""
-    pairs = [(run, found) for run in outcome.runs if (found := outcome.published(run)) is not None and run.kept.size]
-    if not pairs:
-        return []
-    apart = []
-    for run, (mean, spread) in pairs:
-        width = np.hypot(np.nan_to_num(run.spread), np.nan_to_num(spread))
-        # Published to three or four digits.
-        if abs(run.mean - mean) > _AGREEMENT * width + 1e-3 * abs(mean):
-            apart.append(f"{run.method.label} ({run.mean:.4g}, published {mean:.4g})")
-    agreeing = f"{len(pairs) - len(apart)} of {len(pairs)} published results are met within three standard deviations"
-    return [f"{agreeing}; apart: {', '.join(apart)}." if apart else f"{agreeing}."]
 
 
 def warnings(outcome: Outcome) -> list[str]:
@@ -85,7 +68,7 @@ def tables(outcome: Outcome) -> list[Table]:
         if run.is_lost.any():
             emphasised.add((i, 4))
         low, high = run.interval(outcome.settings.confidence)
-        error, published = outcome.relative_error(run), outcome.published(run)
+        published = outcome.published(run)
         rows.append(
             [
                 run.method.label,
@@ -95,7 +78,6 @@ def tables(outcome: Outcome) -> list[Table]:
                 if published is None
                 else quantity(published[0], published[1] if np.isfinite(published[1]) else None),
                 f"{run.is_lost.sum()} of {run.is_lost.size}",
-                "" if error is None else quantity(error[0], (error[2] - error[1]) / 2),
                 f"{np.nanmean(run.alpha):.3g}" if run.reasons else "",
                 str(run.rollouts_per_step),
                 f"{1e3 * run.seconds_per_step:.3g}",
@@ -104,15 +86,14 @@ def tables(outcome: Outcome) -> list[Table]:
         )
     percent = f"{outcome.settings.confidence:.0%}"
     columns = (
-        "method", "final cost", f"{percent} interval of the mean", "published", "lost runs", "relative error",
-        "mean α", "rollouts per step", "ms per step", "compilation, s",
+        "method", "final cost", f"{percent} interval of the mean", "published", "lost runs", "mean α",
+        "rollouts per step", "ms per step", "compilation, s",
     )  # fmt: skip
     caption = (
         f"Cost without noise after {outcome.num_steps} steps, mean ± standard deviation over {outcome.settings.seeds} "
         f"seeds, from {quantity(outcome.start_cost)} at the start; {outcome.dim} parameters. Lost runs have no finite cost "
         "in the end; they are not in mean and interval. Bold is the lowest mean, and α-order if it is worse than the "
-        "better of first and zeroth order. The error is that of one estimate at the start. A step's time is that of one "
-        "seed of all that run at once."
+        "better of first and zeroth order. A step's time is that of one seed of all that run at once."
     )
     return [Table(columns, rows, caption, frozenset(emphasised))]
 
@@ -204,11 +185,8 @@ def drawings(outcome: Outcome) -> Drawings:
 
 
 def final(outcome: Outcome):
-    """Final cost of every seed, and the relative error of one estimate, a row for each method."""
-    has_errors = outcome.errors is not None
-    widths = {"width_ratios": [1.5, 1]} if has_errors else None
-    height = 1.1 + 0.31 * len(outcome.runs)
-    figure, axes = subplots(1, 1 + has_errors, height=height, sharey=True, gridspec_kw=widths)
+    """Final cost of every seed, a row for each method."""
+    figure, axes = subplots(1, 1, height=1.1 + 0.31 * len(outcome.runs))
     left = axes[0, 0]
     rows = np.arange(len(outcome.runs))[::-1]
     limit = _limit(outcome)
@@ -232,10 +210,6 @@ def final(outcome: Outcome):
         if notes:
             text = ", ".join(notes)
             left.text(0.99, y, text, transform=left.get_yaxis_transform(), ha="right", va="center", fontsize=8.5)
-        error = outcome.relative_error(run)
-        if has_errors and error is not None:
-            spread = np.maximum([[error[0] - error[1]], [error[2] - error[0]]], 0)
-            axes[0, 1].errorbar(error[0], y, xerr=spread, fmt="o", ms=5, color=colour, capsize=2.5, elinewidth=1.3)
     left.set_yticks(rows, [run.method.label for run in outcome.runs])
     left.set_ylim(-0.6, len(rows) - 0.4)
     low = min([*(float(cost) for run in outcome.runs for cost in run.kept), limit])
@@ -246,25 +220,15 @@ def final(outcome: Outcome):
         margin = 0.04 * (limit - low or 1.0)
         left.set_xlim(low - margin, limit + margin)
     left.set(title="Cost without noise after the last step", xlabel="cost")
-    if has_errors:
-        _log_scale(axes[0, 1])
-        axes[0, 1].set(title="Relative error of one estimate at the start", xlabel="error / norm of the gradient")
     _mark_ours(left, outcome.runs)
     settings = outcome.settings
     percent = f"{settings.confidence:.0%}"
     diamonds = "; diamonds are published means ± standard deviations" if outcome.reference else ""
-    errors = (
-        " Right, distance of one estimate at the start to the gradient, over its norm: root mean square of "
-        f"{settings.error_repeats} estimates of {outcome.num_samples} rollouts, with its {percent} interval; the gradient is "
-        f"an unbiased estimate from {settings.reference_samples} rollouts."
-        if outcome.errors is not None
-        else ""
-    )
     caption = (
-        f"Left, dots are seeds, bars the means with their {percent} intervals{diamonds}. An arrow stands for a mean ± "
-        f"standard deviation beyond the panel.{errors}"
+        f"Dots are seeds, bars the means with their {percent} intervals{diamonds}. An arrow stands for a mean ± standard "
+        "deviation beyond the panel."
     )
-    return figure, "Where each method ends, and how far off one estimate is", caption
+    return figure, "Where each method ends", caption
 
 
 def curves(outcome: Outcome):

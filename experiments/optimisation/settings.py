@@ -85,8 +85,6 @@ class Settings(OwnScene, RunSettings):
     """What is optimised; see `experiments.optimisation.published`. A scene of one's own, by its controls, takes its place."""
     stddev: Positive = 0.1
     """Of the noise on each control of an own scene, in halves of its range."""
-    dynamics: Literal["published", "mjx"] = "published"
-    """Whether the paper's own equations simulate the task, or MJX with contact, as it does an own scene."""
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]
     """In the order of the table."""
     seeds: Count = 10
@@ -99,10 +97,6 @@ class Settings(OwnScene, RunSettings):
     """Of plain gradient descent; without it, as published."""
     evaluations: Annotated[int, Field(ge=1)] = 50
     """How often the cost without noise is measured on the way."""
-    error_repeats: Annotated[int, Field(ge=0)] = 100
-    """Estimates at the start of which the relative error is measured; 0 leaves it out."""
-    reference_samples: Annotated[int, Field(ge=100)] = 50_000
-    """Rollouts behind the gradient that those are compared with."""
     confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
     """Of every interval."""
 
@@ -115,6 +109,4 @@ class Settings(OwnScene, RunSettings):
             raise ValueError("task: required where there is no scene, and missing")
         if self.scene is not None and self.learning_rate is None:
             raise ValueError("learning_rate: required with a scene of one's own, and missing; in control² per cost")
-        if self.dynamics == "mjx" and self.task == "lqr":
-            raise ValueError('dynamics: must be "published" for lqr, which has no contact to simulate')
         return self

@@ -1,8 +1,6 @@
 """From settings to numbers, and what a gradient is worth by them."""
 
 import functools
-import itertools
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,19 +9,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.policy_gradient.settings import Settings
-from experiments.problems.published_scenes import push
+from experiments.problems.push import push
 from experiments.workspace import Workspace
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import plan_by_noise, stream
 
 DISCRETE, ONSET = GRADIENTS = ("discrete", "onset")
-ESTIMATORS = {"first": "first order", "alpha": "α-order"}
 Vectors = Float[np.ndarray, "estimates dim"]
 
 
@@ -74,15 +70,6 @@ class Estimated(eqx.Module):
     alpha: Float[Any, "*estimates"]
     reason: Int[Any, "*estimates"]
     cost: Float[Any, "*estimates"]
-
-    def weight(self, estimator: str) -> Float[Array, ""]:
-        """Give α of "first" order, which is 1, or of "alpha"-order."""
-        return jnp.ones_like(self.alpha) if estimator == "first" else self.alpha
-
-    def value(self, estimator: str) -> Float[Array, " dim"]:
-        """Give the estimate of "first" order or of "alpha"-order."""
-        alpha = self.weight(estimator)
-        return alpha * self.first + (1 - alpha) * self.unbiased
 
 
 class Judged(NamedTuple):
@@ -158,39 +145,19 @@ def _root(square: float) -> float:
 
 
 @dataclass(frozen=True)
-class Course:
-    """Descents of one kind on a task, one per seed."""
-
-    name: str  # of the task
-    title: str  # of the task
-    estimator: str  # of `ESTIMATORS`
-    gradient: str  # of `GRADIENTS`
-    costs: Float[np.ndarray, "seeds steps"]  # mean costs under noise, before each step and at the end
-    alphas: Float[np.ndarray, "seeds steps"]  # weights of the first order, likewise
-    seconds: float  # of all seeds, with compilation if there was any
-
-    @property
-    def final(self) -> tuple[float, float | None]:
-        """Mean final cost, with its standard deviation over seeds (none of one)."""
-        final = self.costs[:, -1]
-        return float(final.mean()), float(final.std(ddof=1)) if len(final) > 1 else None
-
-
-@dataclass(frozen=True)
 class Outcome:
-    """All that was measured: by task and point, and the descents."""
+    """All that was measured, by task and point."""
 
     settings: Settings
     cells: list[Cell]
-    courses: list[Course]
 
     def of(self, *names: str) -> list[Cell]:
         """Give the cells of some tasks."""
         return [cell for cell in self.cells if cell.name in names]
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per cell and gradient, and per course, for metrics.csv."""
-        rows: list[dict[str, Any]] = [
+        """One row per cell and gradient, for metrics.csv."""
+        return [
             {
                 "task": cell.name,
                 "point": cell.point,
@@ -201,38 +168,12 @@ class Outcome:
             for cell in self.cells
             for gradient in GRADIENTS
         ]
-        for course in self.courses:
-            final, spread = course.final
-            rows.append(
-                {
-                    "task": course.name,
-                    "point": f"descent by {course.estimator}",
-                    "gradient": course.gradient,
-                    "alpha": float(course.alphas.mean()),
-                    "final_cost": final,
-                    "final_cost_stddev": "" if spread is None else spread,
-                }
-            )
-        return rows
 
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
 DEFAULT_CONTACT = mg.Softness(stiffness=2500.0, damping_ratio=1.0, impedance=(0.9, 0.95), width=0.001)
 WALL_STIFFNESS = 1e4  # 1/s², that of the README
-THROW_START, THROW_STDDEV, THROW_RATE = 0.5, 0.1, 0.02  # rad, rad, of Adam; the README's
-HOPPER_RATE = 0.01
 _JUMPS = (0.62, 1.29)  # rad: throws between about 35 and 74 degrees clear the wall
-
-
-@dataclass(frozen=True)
-class Descent:
-    """How a task is optimised by Adam, by each of some estimators: "first" order or "alpha"-order."""
-
-    start: Float[Array, " dim"]
-    stddev: float
-    learning_rate: float
-    num_steps: int
-    estimators: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -255,7 +196,6 @@ class Problem:
     points: Sequence[Point]
     num_samples: int  # rollouts of one estimate
     has_jump_of_force: bool  # whether its contacts set in with a force that is not zero
-    descent: Descent | None = None  # None if it is not optimised
 
     def objective(self, gradient: str, stddev: float) -> mg.Objective:
         """Return the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""
@@ -270,7 +210,7 @@ def problem(name: str, settings: Settings) -> Problem:
         task = push(stiffness)
         start = Point("start", task.initial_params())
         return Problem(name, f"Push, {stiffness:g} N/m", task, task.stddev, [start], 16, has_jump_of_force=False)
-    return _hopper(settings) if name == "hopper" else _throw(name, settings)
+    return _hopper() if name == "hopper" else _throw(name, settings)
 
 
 def _throw(name: str, settings: Settings) -> Problem:
@@ -284,24 +224,20 @@ def _throw(name: str, settings: Settings) -> Problem:
     ]
     title = "Throw, default contact" if is_default else "Throw, gentle contact"
     task = mg.tasks.ball_wall().with_softness(softness)
-    descent = Descent(jnp.array([THROW_START]), THROW_STDDEV, THROW_RATE, settings.throw_steps, ["alpha"])
-    return Problem(name, title, task, settings.angle_stddev, points, 50, has_jump_of_force=is_default, descent=descent)
+    return Problem(name, title, task, settings.angle_stddev, points, 50, has_jump_of_force=is_default)
 
 
-def _hopper(settings: Settings) -> Problem:
+def _hopper() -> Problem:
     task = mg.tasks.hopper()
-    start = task.initial_params()
-    descent = Descent(start, 0.1, HOPPER_RATE, settings.hopper_steps, ["first", "alpha"])
-    points = [Point("start", start)]
-    return Problem("hopper", "Hopper", task, 0.1, points, 32, has_jump_of_force=True, descent=descent)
+    return Problem("hopper", "Hopper", task, 0.1, [Point("start", task.initial_params())], 32, has_jump_of_force=True)
 
 
 @eqx.filter_jit
 def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKeyArray, num_samples: int) -> Estimated:
     """Estimate once, by all estimators from the same rollouts.
 
-    The public estimators give the same numbers one by one. To compile takes longer than all rollouts, so bias, reference, α
-    and descents share this one program.
+    The public estimators give the same numbers one by one. To compile takes longer than all rollouts, so bias, reference and α
+    share this one program.
     """
     objective = objective.sized_for(params)
     plan = plan_by_noise(objective, num_samples, None)
@@ -313,18 +249,16 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Compare both gradients on all tasks."""
-    cells, courses = [], []
+    cells = []
     with workspace.stage("estimates", "tasks", len(settings.tasks)) as advance_to:
         for number, name in enumerate(settings.tasks):
-            key, descent_key = jax.random.split(jax.random.fold_in(jax.random.key(settings.seed), number))
+            key = jax.random.fold_in(jax.random.key(settings.seed), number)
             one = problem(name, settings)
             workspace.check(one.task.scene, name=one.title)
             for i, k in enumerate(jax.random.split(key, len(one.points))):
                 cells.append(workspace.once(f"{name} {i}", functools.partial(_cell, one, i, k, settings)))
-            descend = functools.partial(_courses, one, descent_key, settings.num_seeds)
-            courses += workspace.once(f"{name}, descents", descend)
             advance_to(number + 1)
-    return Outcome(settings, cells, courses)
+    return Outcome(settings, cells)
 
 
 def _cell(one: Problem, index: int, key: PRNGKeyArray, settings: Settings) -> Cell:
@@ -343,29 +277,3 @@ def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: 
     objective = one.objective(gradient, one.stddev)
     found = [estimated(objective, params, key, one.num_samples) for key in keys]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
-
-
-def _courses(one: Problem, key: PRNGKeyArray, num_seeds: int) -> list[Course]:
-    descent, seeds, courses = one.descent, jax.random.split(key, num_seeds), []
-    if descent is None or not descent.num_steps:
-        return []
-    for estimator, gradient in itertools.product(descent.estimators, GRADIENTS):
-        started = time.perf_counter()
-        histories = [_descend(one, descent, gradient, estimator, seed) for seed in seeds]
-        seconds = time.perf_counter() - started
-        costs = np.array([[step.cost for step in history] for history in histories])
-        alphas = np.array([[step.weight(estimator) for step in history] for history in histories])
-        courses.append(Course(one.name, one.title, estimator, gradient, costs, alphas, seconds))
-    return courses
-
-
-def _descend(one: Problem, descent: Descent, gradient: str, estimator: str, seed: PRNGKeyArray) -> list[Estimated]:
-    """Descend by Adam; the last of what is given back is at the final parameters."""
-    objective, optimiser = one.objective(gradient, descent.stddev), optax.adam(descent.learning_rate)
-    params, state, history = descent.start, optimiser.init(descent.start), []
-    *steps, end = jax.random.split(seed, descent.num_steps + 1)
-    for key in steps:
-        history.append(estimated(objective, params, key, one.num_samples))
-        change, state = optimiser.update(history[-1].value(estimator), state)
-        params = jnp.asarray(optax.apply_updates(params, change))
-    return [*history, estimated(objective, params, end, one.num_samples)]

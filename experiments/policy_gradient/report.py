@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.policy_gradient.measure import DISCRETE, ESTIMATORS, GRADIENTS, ONSET, Cell, Outcome, mean_and_error
+from experiments.policy_gradient.measure import DISCRETE, GRADIENTS, ONSET, Cell, Outcome, mean_and_error
 from experiments.report import Table
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import joined, percent, quantity
@@ -70,7 +70,7 @@ def findings(outcome: Outcome) -> list[str]:
 
 
 def tables(outcome: Outcome) -> list[Table]:
-    """Tabulate both gradients at every point, and the descents."""
+    """Tabulate both gradients at every point."""
     rows, emphasised = [], set()
     for cell in outcome.cells:
         for gradient in GRADIENTS:
@@ -98,27 +98,7 @@ def tables(outcome: Outcome) -> list[Table]:
         "to either side; bold where it is not chance and above five per cent. Component along the reference: 1 is right. Errors: "
         "root mean square of one estimate."
     )
-    found = [Table(columns, rows, caption, frozenset(emphasised)), _descents(outcome)]
-    return [table for table in found if table.rows]
-
-
-def _descents(outcome: Outcome) -> Table:
-    rows = [
-        [
-            course.title,
-            ESTIMATORS[course.estimator],
-            course.gradient,
-            f"{course.costs[:, 0].mean():.4g}".replace("-", "−"),
-            quantity(*course.final),
-            f"{course.alphas[:, :-1].mean():.2f}",
-            f"{course.seconds:.1f}",
-        ]
-        for course in outcome.courses
-    ]
-    columns = ("task", "estimator", "derivative", "cost at the start", "final cost", "mean α", "s")
-    return Table(
-        columns, rows, "Descents; costs under noise, mean and standard deviation over seeds; time of all seeds."
-    )
+    return [Table(columns, rows, caption, frozenset(emphasised))]
 
 
 def _is_biased(cell: Cell, gradient: str) -> bool:
@@ -161,8 +141,7 @@ _THROWS = ("ball_wall", "ball_wall_default")
 
 def drawings(outcome: Outcome) -> Drawings:
     """Name the figures in order of reading."""
-    found: Drawings = {"summary": summarised} | ({"throw": throw} if outcome.of(*_THROWS) else {})
-    return found | ({"descent": descent} if outcome.courses else {})
+    return {"summary": summarised} | ({"throw": throw} if outcome.of(*_THROWS) else {})
 
 
 def summarised(outcome: Outcome):
@@ -243,31 +222,3 @@ def throw(outcome: Outcome):
         "last that do not; there neither derivative sees the jump."
     )
     return figure, "Throws over the wall", caption
-
-
-def descent(outcome: Outcome):
-    """A column per task and estimator: cost above, α below."""
-    courses = outcome.courses
-    kinds = list(dict.fromkeys((course.name, course.estimator) for course in courses))
-    figure, axes = subplots(2, len(kinds), height=4.6, sharex="col", height_ratios=[2, 1])
-    for (above, below), kind in zip(axes.T, kinds, strict=True):
-        for course in courses:
-            if (course.name, course.estimator) != kind:
-                continue
-            style = {"ls": (0, (4, 2))} if course.gradient == ONSET else {}
-            colour, steps = _COLOURS[course.gradient], np.arange(course.costs.shape[1])
-            for axis, values in ((above, course.costs), (below, course.alphas)):
-                axis.plot(steps, values.T, color=colour, lw=0.7, alpha=0.35)
-                axis.plot(steps, values.mean(axis=0), color=colour, lw=2, label=f"{course.gradient} gradient", **style)
-            title = course.title.replace("Throw, ", "Throw,\n")
-            above.set_title(f"{title}, {ESTIMATORS[kind[1]]}")
-        above.yaxis.set_major_formatter("{x:g}")
-        below.set(ylim=(-0.05, 1.05), xlabel="step")
-    axes[0, 0].set_ylabel("cost")
-    axes[1, 0].set_ylabel("α")
-    legend_below(figure, axes[0, 0], 2)
-    caption = (
-        f"Adam from the same start, {outcome.settings.num_seeds} seeds, thick their mean. Cost under noise, from the rollouts of "
-        "each step; below, weight of the first order."
-    )
-    return figure, "Descents", caption

@@ -11,7 +11,7 @@ Angle = Annotated[float, Field(gt=0, lt=1.5)]
 
 
 class Settings(RunSettings):
-    """Both gradients of each task against an unbiased reference, what α-order makes of them, and where a descent ends."""
+    """Both gradients of each task against an unbiased reference, and what α-order makes of them."""
 
     tasks: Annotated[tuple[TaskName, ...], Field(min_length=1)]
     """Which tasks; `ball_wall_default` has MuJoCo's default contact in place of the scene's own."""
@@ -23,9 +23,3 @@ class Settings(RunSettings):
     """Independent estimates of each kind at each point, from which means and errors are taken."""
     num_references: Annotated[int, Field(ge=8)]
     """Further estimates, all unbiased, behind the reference."""
-    num_seeds: Annotated[int, Field(ge=1)]
-    """Descents of each kind."""
-    throw_steps: Annotated[int, Field(ge=0)]
-    """Of the descent on the throw, with the README's settings; 0 leaves it out."""
-    hopper_steps: Annotated[int, Field(ge=0)]
-    """Of the descent on the hopper; 0 leaves it out."""

@@ -1,131 +1,83 @@
-"""Comparison of estimators at an equal number of rollouts, with intervals for errors, biases and variances."""
+"""Comparison of estimators at an equal number of rollouts, with intervals for errors and biases."""
 
-import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from mjxgrad.diagnostics.bias_variance import map_in_chunks
-from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, checked
+from mjxgrad.diagnostics.statistics import checked
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
-from mjxgrad.objective import Objective, as_vector, flattened
+from mjxgrad.objective import Objective
 
 # Rollouts at a time over all repetitions that run together: enough to fill a CPU's vector units.
 _ROLLOUTS_AT_A_TIME = 4096
 # An estimator may refuse a number of samples (odd ones, say) and take the next smaller one.
 _NEIGHBOURS = 3
-# With fewer samples a bootstrap misses the tails, and a test of normality has no power.
-_FEWEST_FOR_BOOTSTRAP = 20
-
-
-@dataclasses.dataclass(frozen=True)
-class Rollouts:
-    """A budget of rollouts per estimate, as the estimate itself counts them; at least 2."""
-
-    count: int
-
-    def __post_init__(self):
-        if self.count < 2:
-            raise ValueError(f"count must be at least 2 rollouts, got {self.count}")
-
-
-class Affordable(NamedTuple):
-    """The number of samples that a budget allows."""
-
-    num_samples: int
 
 
 class Comparison(eqx.Module):
-    r"""The results of `compare`, one row per estimator in the order of `names`.
-
-    All numbers concern the whole estimate, not a single sample. The first axis of an interval holds its lower and upper end.
+    """The results of `compare`, one row per estimator in the order of `names`; they concern whole estimates, not samples.
 
     Attributes:
         names: names of the estimators.
         num_samples: number of samples requested from each estimator.
         num_rollouts: number of rollouts that one estimate reports, at most the budget.
-        num_gradient_rollouts: number of differentiated rollouts among them.
-        num_repeats: number of estimates per estimator.
         num_finite: number of finite estimates; all fields below use these alone.
-        finite_fraction: mean share of finite samples within the finite estimates.
         mean: mean estimate.
         bias: mean less reference.
-        bias_interval: Welch's interval, with the reference's own error.
-        rmse: root-mean-square distance to the truth, corrected for the reference's variance.
-        rmse_interval: interval of `rmse`, see `root_mean_square_interval`.
+        bias_interval: lower and upper end of Student's interval.
+        rmse: root-mean-square distance to the truth.
+        rmse_interval: lower and upper end, see `root_mean_square_interval`.
         variance: trace of the covariance of the estimates.
-        variance_interval: interval of the variance.
-        variance_methods: method of each variance interval, "chi_square" or "bootstrap".
         claimed_variance: mean variance claimed by the estimates, the sum of their squared standard errors; an honest
             estimator has it equal to `variance`.
-        reference: the true gradient.
-        reference_error: standard error of the reference.
-        confidence: coverage of every interval.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     num_samples: Int[np.ndarray, " estimators"]
     num_rollouts: Int[np.ndarray, " estimators"]
-    num_gradient_rollouts: Int[np.ndarray, " estimators"]
-    num_repeats: int = eqx.field(static=True)
     num_finite: Int[np.ndarray, " estimators"]
-    finite_fraction: Float[np.ndarray, " estimators"]
     mean: Float[np.ndarray, "estimators dim"]
     bias: Float[np.ndarray, "estimators dim"]
     bias_interval: Float[np.ndarray, "2 estimators dim"]
     rmse: Float[np.ndarray, " estimators"]
     rmse_interval: Float[np.ndarray, "2 estimators"]
     variance: Float[np.ndarray, " estimators"]
-    variance_interval: Float[np.ndarray, "2 estimators"]
-    variance_methods: tuple[str, ...] = eqx.field(static=True)
     claimed_variance: Float[np.ndarray, " estimators"]
-    reference: Float[np.ndarray, " dim"]
-    reference_error: Float[np.ndarray, " dim"]
-    confidence: float = eqx.field(static=True)
-
-    @property
-    def is_biased(self) -> Bool[np.ndarray, " estimators"]:
-        """Whether the bias interval of some coordinate excludes zero; with many coordinates some do by chance."""
-        low, high = self.bias_interval
-        return ((low > 0) | (high < 0)).any(axis=-1)
 
 
 def compare(
     estimators: Mapping[str, Estimator],
     objective: Objective,
-    params: PyTree,
+    params: Float[Array, " dim"],
     key: PRNGKeyArray,
     *,
-    budget: Rollouts,
-    reference: tuple[PyTree, PyTree] | PyTree,
+    budget: int,
+    reference: ArrayLike,
     num_repeats: int = 200,
     confidence: float = 0.95,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Comparison:
     """Measure root-mean-square error, bias and variance of estimators under an equal budget.
 
-    Each estimator gets the largest `num_samples` whose reported rollouts stay within the budget. Its
-    repetitions are independent and run in one compiled program. A later call with the same estimator and shapes reuses that
-    program. All estimators share the same keys, which reduces chance differences.
+    Each estimator gets the largest `num_samples` whose reported rollouts stay within the budget. Its repetitions are
+    independent and run in one compiled program. All estimators share the same keys, which reduces chance differences.
 
     Args:
         estimators: estimators by name; each is called like `mjxgrad.estimators.zeroth_order`. Bind settings by
             `functools.partial`.
         objective: the objective to differentiate.
-        params: the point: a vector, or a pytree whose floating-point arrays the comparison then has as one vector.
+        params: the point.
         key: consumed here.
-        budget: `Rollouts(count)` for one estimate.
-        reference: the true gradient, in the form of `params`, and its standard error; or the gradient alone if it is exact (a
-            closed form). The error must be well known, from many more samples than an estimate has.
+        budget: rollouts of one estimate, as the estimate itself counts them. At least 2.
+        reference: the true gradient, of the shape of `params`.
         num_repeats: number of estimates per estimator. At least 2.
         confidence: coverage of the intervals.
-        progress: called after every estimator with the number done and the total.
 
     Returns:
         The comparison. Estimates that are not finite are counted and left out.
@@ -133,47 +85,29 @@ def compare(
     Raises:
         ValueError: if there is no estimator, the budget buys no estimate of one, fewer than two of its estimates are
             finite, shapes do not fit, or a number is out of range.
-
-    Example:
-        >>> compare(
-        ...     {"first": first_order, "pairs": functools.partial(zeroth_order, antithetic=True)},
-        ...     objective, params, key, budget=Rollouts(100), reference=(truth, standard_error),
-        ... )
     """
     checked(confidence)
     if not estimators:
         raise ValueError("estimators must have at least one entry, got none")
     if num_repeats < 2:
         raise ValueError(f"num_repeats must be at least 2, got {num_repeats}")
-    objective, params, _ = as_vector(objective, params)
-    truth, error = _reference(reference, params.shape)
+    truth = np.asarray(reference, float)
+    if truth.shape != params.shape or not np.isfinite(truth).all():
+        raise ValueError(f"reference must be finite, of the shape {params.shape} of params, got {truth}")
     timing_key, repeats_key = jax.random.split(key)
     rows = []
     for name, estimator in estimators.items():
         try:
-            bought = affordable(estimator, objective, params, timing_key, budget)
+            num_samples = affordable(estimator, objective, params, timing_key, budget)
         except ValueError as refusal:
             raise ValueError(f"{name}: {refusal}") from refusal
-        at_a_time = max(1, min(num_repeats, _ROLLOUTS_AT_A_TIME // bought.num_samples))
-        estimates = _repeat(
-            estimator, objective, params, jax.random.split(repeats_key, num_repeats), bought.num_samples, at_a_time
-        )
-        rows.append(_row(name, jax.tree.map(np.asarray, estimates), bought, truth, error, confidence))
-        if progress is not None:
-            progress(len(rows), len(estimators))
+        at_a_time = max(1, min(num_repeats, _ROLLOUTS_AT_A_TIME // num_samples))
+        keys = jax.random.split(repeats_key, num_repeats)
+        estimates = jax.tree.map(np.asarray, _repeat(estimator, objective, params, keys, num_samples, at_a_time))
+        rows.append({"num_samples": num_samples, **_row(name, estimates, truth, confidence)})
     columns = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
     intervals = {name: np.moveaxis(columns.pop(name), 1, 0) for name in list(columns) if name.endswith("interval")}
-    methods = tuple(str(method) for method in columns.pop("variance_methods"))
-    return Comparison(
-        names=tuple(estimators),
-        num_repeats=num_repeats,
-        variance_methods=methods,
-        reference=truth,
-        reference_error=error,
-        confidence=confidence,
-        **columns,
-        **intervals,
-    )
+    return Comparison(names=tuple(estimators), **columns, **intervals)
 
 
 @eqx.filter_jit
@@ -189,12 +123,7 @@ def _repeat(
 
 
 def _row(
-    name: str,
-    estimates: GradientEstimate,
-    bought: Affordable,
-    truth: Float[np.ndarray, " dim"],
-    error: Float[np.ndarray, " dim"],
-    confidence: float,
+    name: str, estimates: GradientEstimate, truth: Float[np.ndarray, " dim"], confidence: float
 ) -> dict[str, object]:
     """Compute all columns for one estimator."""
     is_finite = np.isfinite(estimates.value).all(axis=-1)
@@ -207,64 +136,36 @@ def _row(
     values = np.asarray(estimates.value, float)[is_finite]
     mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
     bias = mean - truth
-    rmse, rmse_ends = root_mean_square_interval(
-        ((values - truth) ** 2).sum(axis=1),
-        confidence,
-        reference_variance=(error**2).sum(),
-        cross_variance=(4 * (bias * error) ** 2 + 2 * error**4).sum(),
-    )
-    spread_interval = variance_interval(values, confidence)
+    rmse, rmse_ends = root_mean_square_interval(((values - truth) ** 2).sum(axis=1), confidence)
     return {
-        "num_samples": bought.num_samples,
         "num_rollouts": estimates.num_rollouts.flat[0],
-        "num_gradient_rollouts": estimates.num_gradient_rollouts.flat[0],
         "num_finite": count,
-        "finite_fraction": float((estimates.num_finite / estimates.num_samples)[is_finite].mean()),
         "mean": mean,
         "bias": bias,
-        "bias_interval": bias_interval(mean, spread / np.sqrt(count), count, truth, error, confidence=confidence),
+        "bias_interval": bias_interval(mean, spread / np.sqrt(count), count, truth, confidence=confidence),
         "rmse": rmse,
         "rmse_interval": rmse_ends,
-        "variance": spread_interval.value,
-        "variance_interval": spread_interval.ends,
-        "variance_methods": spread_interval.method,
+        "variance": float((spread**2).sum()),
         "claimed_variance": float((np.asarray(estimates.standard_error, float)[is_finite] ** 2).sum(axis=1).mean()),
     }
 
 
-def _reference(
-    reference: tuple[PyTree, PyTree] | PyTree, shape: tuple[int, ...]
-) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
-    both = reference if isinstance(reference, tuple) else (reference, 0.0)
-    value, error = (np.asarray(flattened(one)[0], float) for one in both)
-    # One number is enough for one parameter.
-    value = value.reshape(shape) if value.shape == () and shape == (1,) else value
-    if value.shape != shape or error.shape not in ((), shape):
-        raise ValueError(
-            f"reference must have the shape {shape} of params, got {value.shape} with an error of shape {error.shape}; "
-            "pass (value, standard_error), or the value alone if it is exact"
-        )
-    error = np.broadcast_to(error, shape)
-    if not np.isfinite(value).all() or not (error >= 0).all():
-        raise ValueError(f"reference must be finite with errors of at least 0, got {value} ± {error}")
-    return value, error
-
-
 def affordable(
-    estimator: Estimator, objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, budget: Rollouts
-) -> Affordable:
+    estimator: Estimator, objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, budget: int
+) -> int:
     """Return the largest number of samples within a budget of rollouts, as the estimator itself counts them."""
-    count = budget.count
+    if budget < 2:
+        raise ValueError(f"budget must be at least 2 rollouts, got {budget}")
 
     def reported(num_samples: int) -> int:
         return int(_num_rollouts(estimator, objective, params, key, num_samples))
 
-    num_samples, rollouts = _accepted(reported, count)
-    while rollouts > count:
+    num_samples, rollouts = _accepted(reported, budget)
+    while rollouts > budget:
         # Proportional, since an estimator may roll out several times per sample.
-        fewer = min(num_samples - 1, num_samples * count // rollouts)
-        num_samples, rollouts = _accepted(reported, fewer, f"budget of {count} rollouts buys no estimate; ")
-    return Affordable(num_samples)
+        fewer = min(num_samples - 1, num_samples * budget // rollouts)
+        num_samples, rollouts = _accepted(reported, fewer, f"budget of {budget} rollouts buys no estimate; ")
+    return num_samples
 
 
 @eqx.filter_jit
@@ -333,29 +234,19 @@ def bias_interval(
 def root_mean_square_interval(
     squared_errors: Float[np.ndarray, "*batch repeats"],
     confidence: float = 0.95,
-    *,
-    reference_variance: ArrayLike = 0.0,
-    cross_variance: ArrayLike = 0.0,
 ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "2 *batch"]]:
     r"""Return the root-mean-square error of an estimate from its repetitions, with an interval.
 
     The mean squared error is positive and skewed. Its interval is that of a gamma distribution with equal mean and variance
-    (a
-    chi-square with Satterthwaite's degrees of freedom). For one unbiased normal coordinate with known kurtosis it is exact.
+    (a chi-square with Satterthwaite's degrees of freedom). For one unbiased normal coordinate with known kurtosis it is exact.
     Where a bias dominates it becomes the usual normal interval.
-
-    The variance $v$ of a reference adds to the mean and is subtracted. The error of the reference is common to all
-    repetitions, so it widens the interval.
 
     Args:
         squared_errors: squared distance of each repetition to the reference.
         confidence: coverage of the interval.
-        reference_variance: $v$, the sum over coordinates of the reference's squared standard errors.
-        cross_variance: $\sum_j (2 b_j e_j)^2 + 2 e_j^4$, the variance that the error $e$ of the reference adds to the mean,
-            with the bias $b$.
 
     Returns:
-        The root-mean-square error, zero where the reference's error hides it, and the ends of its interval.
+        The root-mean-square error, and the ends of its interval.
 
     Raises:
         ValueError: if `confidence` is not between 0 and 1.
@@ -367,51 +258,10 @@ def root_mean_square_interval(
     squared_errors = np.asarray(squared_errors, float)
     repeats = squared_errors.shape[-1]
     mean = squared_errors.mean(axis=-1)
-    variance = squared_errors.var(axis=-1, ddof=1) / repeats + np.asarray(cross_variance, float)
+    variance = squared_errors.var(axis=-1, ddof=1) / repeats
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = 2 * mean**2 / variance
         ends = [mean * freedom / stats.chi2.isf(tail, freedom), mean * freedom / stats.chi2.ppf(tail, freedom)]
     # All errors are equal up to rounding: the mean is known.
     ends = np.where(freedom < 1e12, ends, mean)
-    taken_off = np.asarray(reference_variance, float)
-    return np.asarray(np.sqrt(np.maximum(mean - taken_off, 0))), np.sqrt(np.maximum(ends - taken_off, 0))
-
-
-class VarianceInterval(eqx.Module):
-    """A variance (the trace of the covariance with N − 1), the ends of its interval, and the method."""
-
-    value: float
-    ends: Float[np.ndarray, " 2"]
-    method: Literal["chi_square", "bootstrap"] = eqx.field(static=True)
-
-
-def variance_interval(samples: Float[np.ndarray, "samples dim"], confidence: float = 0.95) -> VarianceInterval:
-    """Return the interval of a total variance, by chi-square or bootstrap, whichever suits the samples.
-
-    Chi-square is exact for normal samples of one coordinate and wrong for other distributions. For several coordinates its
-    degrees of freedom follow from the eigenvalues of the covariance. The bootstrap assumes no distribution but needs samples.
-    It is used from 20 samples on, if a kurtosis test rejects normality in some coordinate (5 % over all of them).
-
-    Samples that are not finite are left out; fewer than two give NaN.
-    """
-    tail = (1 - checked(confidence)) / 2
-    samples = np.asarray(samples, float)
-    samples = samples[np.isfinite(samples).all(axis=1)]
-    if len(samples) < 2:
-        return VarianceInterval(np.nan, np.full(2, np.nan), "chi_square")
-    covariance = np.atleast_2d(np.cov(samples, rowvar=False))
-    total = float(np.trace(covariance))
-    if _has_other_tails(samples):
-        ends = bootstrap_variance_interval(samples, confidence)
-        return VarianceInterval(total, ends, "bootstrap")
-    squares = (covariance**2).sum()
-    freedom = (len(samples) - 1) * (total**2 / squares if squares > 0 else 1.0)
-    return VarianceInterval(total, total * freedom / stats.chi2.isf([tail, 1 - tail], freedom), "chi_square")
-
-
-def _has_other_tails(samples: Float[np.ndarray, "samples dim"]) -> bool:
-    """Return whether some coordinate has another kurtosis than a normal distribution."""
-    varied = samples[:, np.ptp(samples, axis=0) > 0]
-    if len(samples) < _FEWEST_FOR_BOOTSTRAP or varied.shape[1] == 0:
-        return False
-    return bool(stats.kurtosistest(varied).pvalue.min() < 0.05 / varied.shape[1])
+    return np.sqrt(mean), np.sqrt(ends)

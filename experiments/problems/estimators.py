@@ -1,16 +1,31 @@
 r"""Estimators to compare with, beside those of the library: REINFORCE with reward-to-go, and least squares."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from experiments.optimisation.settings import MethodSettings
 from mjxgrad.estimators import alpha_order, control_variate, first_order, zeroth_order
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, as_real
+from mjxgrad.estimators.rules import BiasConstrained, Concavity, Consistent, InverseVariance
 from mjxgrad.estimators.samples import Plan, check_baseline, sample
 from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise, as_vector
 
-__all__ = ["alpha_order", "control_variate", "first_order", "least_squares", "reinforce", "zeroth_order"]
+__all__ = ["alpha_order", "control_variate", "estimator", "first_order", "least_squares", "reinforce", "zeroth_order"]
+
+_RULES = {"consistent": Consistent, "inverse_variance": InverseVariance, "concavity": Concavity}
+
+
+def estimator(method: MethodSettings, gamma: float = 0.0, bound: float = 0.0) -> functools.partial:
+    """Return an estimator, its options bound; the rule "bias_constrained" takes the published constants of a task."""
+    options = method.options
+    if method.rule is not None:
+        is_published = method.rule == "bias_constrained"
+        options["rule"] = BiasConstrained(gamma, bound) if is_published else _RULES[method.rule]()
+    return functools.partial(globals()[method.name], **options)
 
 
 def least_squares(

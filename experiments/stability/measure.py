@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 import mjxgrad as mg
 from experiments.parallel import in_threads
-from experiments.problems.soundness import soundness
 from experiments.stability.scenes import (
     FIELDS,
     GRAVITY,
@@ -104,8 +103,7 @@ class SceneOutcome:
     # By simulator (`C_MUJOCO`, and mjxgrad by its precision) and point: `motion`, of `Motion`; of `Derivative` that along a
     # change of the start (`derivative`) and of the model's parameters (`derivative_by_parameters`); whether numbers that are
     # not finite left the rollout without a flag (`silent`); whether some step is not solved and `Trajectory.unsolved` is zero
-    # (`untold`); whether the gradient is not finite or explodes and neither `Trajectory.diverged` nor `soundness` tells
-    # (`missed`); difference of the final positions from those of C MuJoCo over what a body flies (`apart_from_c`).
+    # (`untold`); difference of the final positions from those of C MuJoCo over what a body flies (`apart_from_c`).
     found: xr.Dataset
 
 
@@ -515,17 +513,12 @@ def _of_mjxgrad(case: _Case, run: Run, truth: np.ndarray, in_c: Course, toleranc
         classify_derivative(slope, is_finite, is_sound, one, largest=bound, tolerance=tolerance)
         for slope, one in zip(slopes, truth, strict=True)
     ]
-    is_wild = ~is_finite | ~(np.abs(slopes) <= bound).all(axis=0)
-    judged = jax.vmap(lambda gradient, diverged: soundness(gradient, diverged, bound=bound).is_sound)(
-        (fields, *slopes), ~is_sound
-    )
     return {
         "motion": motion,
         "derivative": kinds[0],
         "derivative_by_parameters": kinds[1],
         "silent": run.is_silent,
         "untold": (motion == Motion.NOT_SOLVED) & ~run.is_unsolved,
-        "missed": is_wild & is_sound & np.asarray(judged),
         "apart_from_c": apart,
     }
 

@@ -33,6 +33,8 @@ _PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_ac
 _Pairs = tuple[ContactPair, ...]
 # Plain integers: NumPy's integers do not equal MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
+
+
 _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "stiffness": (lambda x: (x > 0) & (x < np.inf), "positive and finite"),
     "damping_ratio": (lambda x: x >= 0, "at least 0"),
@@ -68,7 +70,8 @@ class Softness(eqx.Module):
         width: depth over which the impedance rises from $d_0$ to $d_w$, in m.
         margin: distance at which force begins, in m; at least 0. Each geom of a pair gets half of it.
         rest_acceleration: $a_0$ under which bodies rest as high as without margin, in m/s²; None lets them hover.
-        pairs: pairs of geom names; only these pairs change. None is all.
+        geoms: names of geoms; only pairs with at least one of them change.
+        pairs: pairs of geom names; only these pairs change.
     """
 
     stiffness: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
@@ -77,10 +80,15 @@ class Softness(eqx.Module):
     width: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
     margin: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
     rest_acceleration: Float[Array, "..."] | None = eqx.field(converter=as_float, default=None)
+    geoms: tuple[str, ...] | None = eqx.field(static=True, default=None)
     pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse a height without a margin, and values out of their range if they are known."""
+        """Refuse several subsets at once, a height without a margin, and values out of their range if they are known."""
+        if self.geoms is not None and self.pairs is not None:
+            raise ValueError("Softness takes either geoms or pairs, got geoms and pairs")
+        if isinstance(self.geoms, str):
+            raise ValueError(f"geoms must be a tuple of names, got {self.geoms!r}; write ({self.geoms!r},)")
         if self.rest_acceleration is not None and self.margin is None:
             raise ValueError("rest_acceleration must come with a margin, got none; give Softness a margin, too")
         for name, (is_valid, requirement) in _REQUIREMENTS.items():
@@ -101,7 +109,7 @@ class Softness(eqx.Module):
         Returns:
             One `Softness` whose leaves share their leading axis.
         """
-        pairs = parts.pop("pairs", None)
+        static = {name: parts.pop(name) for name in ("geoms", "pairs") if name in parts}
         arrays = {name: as_float(value) for name, value in parts.items() if value is not None}
         lengths = {name: a.shape[0] for name, a in arrays.items() if a.ndim}
         length = max(lengths.values(), default=1)
@@ -109,16 +117,27 @@ class Softness(eqx.Module):
             is_pair = name == "impedance" and a.shape == (2,) and length != 2
             if a.ndim == 0 or is_pair:
                 arrays[name] = jnp.broadcast_to(a, (length, *a.shape))
-        return cls(**arrays, pairs=pairs)
+        return cls(**arrays, **static)
 
     def selected(self, model: mjx.Model) -> tuple[ContactPair, ...]:
-        """Return the pairs that this softness changes.
+        """Return the pairs that this softness changes; all pairs without a subset.
 
         Raises:
             ValueError: if a name is unknown or can touch nothing.
         """
         everything = contact_pairs(model)
-        return everything if self.pairs is None else named_pairs(everything, self.pairs, "softness.pairs")
+        if self.pairs is not None:
+            return named_pairs(everything, self.pairs, "softness.pairs")
+        if self.geoms is None:
+            return everything
+        known = {name for pair in everything for name in pair.names}
+        for name in self.geoms:
+            if name not in known:
+                raise ValueError(
+                    f"softness.geoms must name geoms that can touch another, got {name!r}; "
+                    f"those that can: {', '.join(sorted(known)) or 'none'}"
+                )
+        return tuple(pair for pair in everything if set(pair.names) & set(self.geoms))
 
     def apply(self, model: mjx.Model) -> mjx.Model:
         r"""Write this softness into a model.

@@ -1,5 +1,6 @@
 """Parameters of a scene from recorded motions, through contact."""
 
+from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
     Parameter,
     armature,
@@ -27,6 +28,7 @@ __all__ = [
     "gains",
     "gear",
     "identify",
+    "inertia",
     "mass",
     "softness",
 ]

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
     Parameter,
     armature,
@@ -32,7 +33,7 @@ from mjxgrad.scene.scene import numbers_of
 _Object = mujoco.mjtObj
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
 _NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
-KINDS = ("mass", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
+KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
@@ -73,9 +74,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
     if kind in _NAMED:
         return _NAMED[kind](scene, *names, bounds=bounds)
-    if len(names) > 1:
-        raise ValueError(f"gains takes one name, got {text!r}")
-    return gains(scene, *names, bounds=bounds)
+    if len(names) > 1 or (bounds is not None and kind == "inertia"):
+        raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
+    return inertia(scene, *names) if kind == "inertia" else gains(scene, *names, bounds=bounds)
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:

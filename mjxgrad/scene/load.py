@@ -240,7 +240,7 @@ def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
 
 
 class _Rigid:
-    """A model without its flexible bodies, whose vertices are bodies like others: MJX need not know what C MuJoCo does to them."""
+    """A model without its flexible bodies: their vertices are bodies like others, and what else they do only C MuJoCo knows."""
 
     nflex = 0
 

@@ -55,7 +55,9 @@ def test_every_pair_gets_the_values_asked_for(unequal):
     np.testing.assert_allclose(got.impedance, [[0.3, 0.6]] * len(unequal.pairs), rtol=1e-12)
     np.testing.assert_allclose(got.width, 0.02, rtol=1e-12)
 
-    # C MuJoCo sees the same.
+
+def test_c_mujoco_sees_the_same_softness(unequal):
+    softness = Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
     model = unequal.with_softness(softness).to_mujoco()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -118,7 +120,7 @@ def test_impedance_alone_keeps_width_and_stiffness(unequal):
 
 def test_a_subset_leaves_other_pairs_alone(unequal):
     before = unequal.contact_parameters()
-    subset = Softness(stiffness=900, damping_ratio=0.7, pairs=(("three", "floor"), ("three", "one"), ("three", "two")))
+    subset = Softness(stiffness=900, damping_ratio=0.7, geoms=("three",))
     after = unequal.with_softness(subset).contact_parameters()
     chosen = np.array(["three" in pair.names for pair in unequal.pairs])
     assert chosen.sum() == 3
@@ -142,9 +144,15 @@ def test_a_geom_shared_with_an_unselected_pair_is_refused(equal):
         equal.with_softness(Softness(stiffness=900, damping_ratio=1, pairs=(("one", "floor"),)))
 
 
-def test_an_unknown_name_is_answered_with_the_known_ones(equal):
+@pytest.mark.parametrize("subset", [{"geoms": ("flor",)}, {"pairs": (("one", "flor"),)}])
+def test_an_unknown_name_is_answered_with_the_known_ones(equal, subset):
     with pytest.raises(ValueError, match=r"flor.*those that can: .*floor"):
-        equal.with_softness(Softness(stiffness=900, damping_ratio=1, pairs=(("one", "flor"),)))
+        equal.with_softness(Softness(stiffness=900, damping_ratio=1, **subset))
+
+
+def test_both_kinds_of_subset_at_once_are_refused():
+    with pytest.raises(ValueError, match="either geoms or pairs"):
+        Softness(geoms=("a",), pairs=(("a", "b"),))
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def priced(*costs, estimator=None):
 
 def stable(ours, theirs, derivative, silent=0):
     """Three points: kinds of motion, of C MuJoCo's, of derivatives, and how many failures carry no flag."""
-    cells = {"motion": [theirs, ours], "derivative": [[-1] * 3, derivative], "missed": [[False] * 3] * 2}
+    cells = {"motion": [theirs, ours], "derivative": [[-1] * 3, derivative]}
     cells["silent"] = [[False] * 3, list(np.arange(3) < silent)]
     found = xr.Dataset({name: (("simulator", "point"), value) for name, value in cells.items()})
     found = found.assign_coords(simulator=["C MuJoCo", "float64"])
@@ -176,7 +176,7 @@ def test_the_answer_is_what_the_numbers_say_in_a_line(kind, outcome, words):
 
 def test_the_verdict_on_stability_says_first_what_is_flagged_then_how_it_compares():
     said = part("stability", "report").verdict(stable([0, 1, 2], [0, 0, 0], [0, 2, 5], silent=2))
-    assert said.startswith("Rollouts with a number that is not finite, and no flag: 2;")
+    assert said.startswith("Rollouts with a number that is not finite, and no flag: 2.")
     assert "2 of 3 motions are as good as C MuJoCo's, 1 worse and none better" in said
 
 

@@ -93,17 +93,13 @@ def report(tmp_path):
     return page(made, tmp_path, name="made up", question="Does it hold on a telephone?", expected="yes", about=about)
 
 
-def test_a_report_fits_a_telephone_runs_nothing_and_fetches_nothing(report, tmp_path):
+def test_a_report_fits_a_telephone_can_be_read_there_runs_nothing_and_fetches_nothing(report, tmp_path):
     found, complaints = opened(report, tmp_path)
     assert not complaints
     assert found["width"] == WIDTH
     assert found["beyond"] <= 0, "pixels that the body is too wide"
     assert found["loaded"]
-
-
-def test_on_a_telephone_pictures_can_be_read_and_what_goes_on_sideways_has_a_sign(report, tmp_path):
-    found, _ = opened(report, tmp_path)
     # The smallest letters of a picture, 8 points of its 11 inches, are 6 pixels high; at the width of the page they were 3.
     assert found["before"] >= 640
-    assert "sideways" in found["hint"]
+    assert "sideways" in found["hint"], "what goes on sideways has a sign"
     assert "gradient" in found["shade"]

@@ -1,15 +1,12 @@
 """The thrown cube, and what the experiment on it says of its numbers."""
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.cube_toss import Course, Outcome, Point, answer, cube_toss, fastest, substepped_step, verdict
-from mjxgrad.rollouts.state import data_of
-from tests.rollouts.test_integration import BALL, HORIZON, RADIUS, RESTITUTION, STEP, thrown
+from experiments.cube_toss import Course, Outcome, Point, answer, cube_toss, fastest, verdict
 
 REFERENCE = np.array([0.5, 0.5, 0.5])
 
@@ -54,27 +51,3 @@ def test_the_first_contact_is_that_of_c_mujoco():
     mujoco.mj_step(model, data, nstep=horizon)
     assert np.abs(data.qpos[0:3] - [0, -0.007, 0.06]).max() < 0.05
     assert np.allclose(found, data.qpos, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_short_steps_at_events_bring_the_bounce_closer_and_flight_is_untouched():
-    scene, heights = mg.load_scene(BALL), RADIUS + jnp.linspace(0, STEP, 9)[:-1]
-
-    def motion(step):
-        def throw(height):
-            def advance(data, _):
-                return step(scene.model, data), data.qpos[0]
-
-            start = data_of(scene, thrown(scene, height), scene.data.ctrl)
-            return jax.lax.scan(advance, start, length=HORIZON + 1)[1]
-
-        return np.asarray(jax.jit(jax.vmap(throw))(heights))
-
-    coarse, fine = motion(mg.step), motion(lambda model, data: substepped_step(model, data, num_substeps=16))
-    assert np.array_equal(coarse[:, :20], fine[:, :20])
-
-    # Along the start height the outcome is a line and a tooth; the tooth of a step cut in sixteen is much smaller.
-    def tooth(values):
-        return np.ptp(values[:, -1] + RESTITUTION * np.asarray(heights))
-
-    assert tooth(fine) < tooth(coarse) / 3

@@ -233,8 +233,9 @@ def test_a_cylinder_that_stands_on_a_box_has_the_slope_as_mean():
     assert np.all(found.spread[0] < 0.1 * np.abs(found.slope).max())
 
 
-CLOTH = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><flexcomp name="cloth" type="grid" count="2 2 1" spacing=".1 .1 .1"
-    pos="0 0 .14" euler="12 7 0" radius=".02" mass=".5" dim="2"><edge equality="true"/></flexcomp></worldbody></mujoco>"""
+CLOTH = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><flexcomp name="cloth" type="grid" count="2 2 1"
+    spacing=".1 .1 .1" pos="0 0 .14" euler="12 7 0" radius=".02" mass=".5" dim="2">
+    <edge equality="true"/></flexcomp></worldbody></mujoco>"""
 
 
 def test_a_cloth_that_lands_has_the_slope_as_mean():

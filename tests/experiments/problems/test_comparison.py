@@ -11,12 +11,10 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from experiments.problems.comparison import (
-    Rollouts,
     affordable,
     bias_interval,
     compare,
     root_mean_square_interval,
-    variance_interval,
 )
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
@@ -72,46 +70,6 @@ def test_an_interval_of_a_root_mean_square_covers_whether_bias_or_variance_makes
     assert np.mean(rmse**2) == pytest.approx(bias**2 + 1, rel=0.01)
 
 
-def test_the_error_of_the_reference_is_taken_off_and_widens_the_interval():
-    """Bias 1, deviation 1; the reference is off by 0.5, which is common to all repetitions."""
-    rng = np.random.default_rng(3)
-    distances = rng.normal(1.0, 1.0, (REPEATS, 100)) - rng.normal(0.0, 0.5, (REPEATS, 1))
-    cross = 4 * (distances.mean(1) * 0.5) ** 2 + 2 * 0.5**4
-    rmse, (low, high) = root_mean_square_interval(distances**2, 0.9, reference_variance=0.25, cross_variance=cross)
-    assert np.mean(rmse**2) == pytest.approx(2.0, rel=0.03)
-    assert share(low, high, np.sqrt(2)) == near(0.9, 0.02)
-    _, (low, high) = root_mean_square_interval(distances**2, 0.9)
-    assert share(low, high, np.sqrt(2)) < 0.5
-
-
-def test_variances_of_normal_samples_get_chi_square_and_cover_in_several_coordinates():
-    """Coordinates of unequal size: total variance 1 + 9, where 3 (n − 1) degrees of freedom would be far too many."""
-    rng, covers, methods = np.random.default_rng(5), [], []
-    for _ in range(600):
-        found = variance_interval(rng.normal(0, [1.0, 3.0], (25, 2)), 0.9)
-        covers.append(found.ends[0] < 10 < found.ends[1])
-        methods.append(found.method)
-    assert np.mean(covers) == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 600))
-    assert methods.count("chi_square") > 500
-
-
-def test_variances_of_other_samples_get_the_bootstrap():
-    """Exponential: chi-square covers 68 % here; a percentile bootstrap a little less than it says."""
-    rng, covers, methods = np.random.default_rng(6), [], []
-    for _ in range(100):
-        found = variance_interval(rng.exponential(1.0, (300, 1)), 0.9)
-        covers.append(found.ends[0] < 1 < found.ends[1])
-        methods.append(found.method)
-    assert np.mean(covers) == pytest.approx(0.87, abs=4 * np.sqrt(0.1 / 100))
-    assert set(methods) == {"bootstrap"}
-
-
-def test_a_variance_without_spread_is_zero_and_without_samples_is_none():
-    assert variance_interval(np.ones((30, 1))).value == 0
-    np.testing.assert_array_equal(variance_interval(np.ones((30, 1))).ends, [0, 0])
-    assert np.isnan(variance_interval(np.array([[1.0], [np.nan]])).value)
-
-
 @pytest.fixture(scope="module")
 def table():
     """Four estimators on the ramp, against its closed form."""
@@ -121,8 +79,8 @@ def table():
         RAMP,
         jnp.array([POINT]),
         jax.random.key(0),
-        budget=Rollouts(51),
-        reference=TRUTH,
+        budget=51,
+        reference=[TRUTH],
         num_repeats=1000,
     )
 
@@ -132,7 +90,6 @@ def test_the_budget_is_of_rollouts_that_are_reported(table):
     assert table.names == ("first", "zeroth", "pairs", "zero noise")
     np.testing.assert_array_equal(table.num_samples, [51, 51, 50, 50])
     np.testing.assert_array_equal(table.num_rollouts, [51, 51, 50, 51])
-    np.testing.assert_array_equal(table.num_gradient_rollouts, [51, 0, 0, 0])
 
 
 def test_an_estimator_that_rolls_out_thrice_per_sample_gets_a_third_of_the_samples():
@@ -140,8 +97,7 @@ def test_an_estimator_that_rolls_out_thrice_per_sample_gets_a_third_of_the_sampl
         estimate = zeroth_order(objective, params, key, num_samples=num_samples)
         return eqx.tree_at(lambda e: e.num_rollouts, estimate, jnp.asarray(3 * num_samples + 1))
 
-    bought = affordable(thrice, RAMP, jnp.array([POINT]), jax.random.key(0), Rollouts(100))
-    assert bought.num_samples == 33
+    assert affordable(thrice, RAMP, jnp.array([POINT]), jax.random.key(0), 100) == 33
 
 
 def _expected(function) -> float:
@@ -162,10 +118,8 @@ def test_errors_are_those_of_the_closed_forms(table):
     left_out = centred / 51 + (spread / STDDEV**2 + TRUTH**2) / (51 * 50)
     exact = np.array([first / 51, left_out, np.nan, from_start / 50])
     known = ~np.isnan(exact)
-    low, high = table.variance_interval
-    # 3 intervals of 95 %: wider by half they hold all but once in 300.
-    assert (low - 0.5 * (high - low) < exact)[known].all()
-    assert (exact < high + 0.5 * (high - low))[known].all()
+    # 1000 estimates know a variance to 4.5 %, with somewhat longer tails; three are looked at.
+    np.testing.assert_allclose(table.variance[known], exact[known], rtol=0.2)
     np.testing.assert_allclose(table.rmse[known], np.sqrt(exact[known]), rtol=0.1)
     np.testing.assert_allclose(table.claimed_variance, table.variance, rtol=0.15)
     assert (np.abs(table.bias[:, 0]) < 4 * np.sqrt(table.variance / 1000)).all()
@@ -180,16 +134,15 @@ def test_a_bias_shows_in_the_error_and_not_in_the_variance():
         objective,
         jnp.array([POINT]),
         jax.random.key(1),
-        budget=Rollouts(40),
-        reference=(np.array([missed + 2 * POINT]), 0.01),
+        budget=40,
+        reference=[missed + 2 * POINT],
         num_repeats=300,
     )
     # Var 2w = 4σ².
     assert table.variance[0] == pytest.approx(4 * STDDEV**2 / 40, rel=0.3)
     low, high = table.bias_interval[:, 0, 0]
     assert low < -missed < high
-    assert high - low > 2 * 1.9 * 0.01  # no narrower than the reference knows
-    assert table.is_biased[0]
+    assert high < 0 or low > 0
     assert table.rmse[0] == pytest.approx(missed, rel=0.01)
 
 
@@ -202,8 +155,8 @@ def test_estimates_that_are_not_finite_are_counted_and_left_out(seed):
         objective,
         jnp.zeros(1),
         jax.random.key(seed),
-        budget=Rollouts(2),
-        reference=0.0,
+        budget=2,
+        reference=[0.0],
         num_repeats=400,
     )
     expected = 400 * 0.8413447**2
@@ -215,12 +168,13 @@ def test_estimates_that_are_not_finite_are_counted_and_left_out(seed):
     ("arguments", "sentence"),
     [
         ({"estimators": {}}, "estimators must have at least one entry, got none"),
+        ({"budget": 1}, "first: budget must be at least 2 rollouts, got 1"),
         ({"num_repeats": 1}, "num_repeats must be at least 2, got 1"),
         ({"confidence": 95.0}, "confidence must be between 0 and 1, got 95.0"),
-        ({"reference": np.zeros(2)}, r"reference must have the shape \(1,\) of params, got \(2,\)"),
-        ({"reference": (0.0, -1.0)}, "reference must be finite with errors of at least 0"),
+        ({"reference": np.zeros(2)}, r"reference must be finite, of the shape \(1,\) of params, got \[0. 0.\]"),
+        ({"reference": [np.nan]}, r"reference must be finite, of the shape \(1,\)"),
         (
-            {"estimators": {"pairs": PAIRS}, "budget": Rollouts(3)},
+            {"estimators": {"pairs": PAIRS}, "budget": 3},
             "pairs: .*num_samples must be at least 4 with antithetic pairs",
         ),
         (
@@ -230,12 +184,7 @@ def test_estimates_that_are_not_finite_are_counted_and_left_out(seed):
     ],
 )
 def test_what_cannot_be_compared_is_refused(arguments, sentence):
-    good = {"objective": RAMP, "estimators": {"first": first_order}, "reference": TRUTH}
-    good |= {"budget": Rollouts(4), "params": jnp.array([POINT]), "key": jax.random.key(0)}
+    good = {"objective": RAMP, "estimators": {"first": first_order}, "reference": [TRUTH]}
+    good |= {"budget": 4, "params": jnp.array([POINT]), "key": jax.random.key(0)}
     with pytest.raises(ValueError, match=sentence):
         compare(**(good | arguments))
-
-
-def test_a_budget_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="count must be at least 2"):
-        Rollouts(1)
