@@ -69,10 +69,6 @@ def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -
     kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
     known = (
         ({geom.mjGEOM_PLANE, geom.mjGEOM_MESH}, "mesh on plane: MJX keeps only corners within 1 mm of the deepest one"),
-        (
-            {geom.mjGEOM_BOX},
-            "box on box: MJX keeps four points, C MuJoCo up to eight; where two edges meet MJX takes a point of a face",
-        ),
         ({geom.mjGEOM_CAPSULE}, "parallel capsules: MJX makes one contact, C MuJoCo two"),
     )
     return [message for kind, message in known if kind in kinds]
