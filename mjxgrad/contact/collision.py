@@ -22,7 +22,7 @@ the rim above the plane, and its derivative is correct in every pose.
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, SupportsInt
 
 import jax
 import jax.numpy as jnp
@@ -114,9 +114,10 @@ def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
     return {dim: np.concatenate(geoms) for dim, geoms in by_dim.items()}
 
 
-def most_contacts(kinds: tuple[int, int]) -> int:
+def most_contacts(kinds: tuple[SupportsInt, SupportsInt]) -> int:
     """Return the largest number of contacts of a pair of geoms of two types."""
-    return boxes.NUM_CONTACTS if kinds == (_BOX, _BOX) else _MJX_FUNCTIONS[kinds].ncon
+    first, second = map(int, kinds)
+    return boxes.NUM_CONTACTS if (first, second) == (_BOX, _BOX) else _MJX_FUNCTIONS[first, second].ncon  # pyright: ignore
 
 
 def slot_dims(model: mjx.Model) -> Int[np.ndarray, " contacts"]:
