@@ -1,10 +1,10 @@
 r"""Contacts of two boxes, where C MuJoCo 3.17 has them: up to eight where faces touch, one where edges cross.
 
 **Which axis.** Boxes overlap unless an axis separates them: a face normal of either, or an edge of one across an edge of the
-other. Along a unit axis $n$ their separation is $|n·p| - \sum_i h_i |n·a_i|$, with $p$ between the centres, $a_i$ the six axes
-of both boxes and $h_i$ half their lengths (m). The axis with the largest separation is the contact's normal. Edges have to be
-better than faces by a millionth of the separation, and by 5 % if they differ by less than 8° from the best face. Parallel edges
-have no axis.
+other. Along a unit axis $n$ their separation is $|n·p| - \sum_i h_i |n·a_i|$, with $p$ between the centres. The six axes of both
+boxes are $a_i$, and $h_i$ is half their length (m). The axis with the largest separation is the contact's normal. Edges have to
+be better than faces by a millionth of the separation, and by 5 % if they differ by less than 8° from the best face. Parallel
+edges have no axis.
 
 **Faces.** The box with that normal clips the face of the other box that looks most against it. The corners of what is left are
 the contacts. Each lies half way between both surfaces along the normal, and its distance is their distance there.
@@ -34,7 +34,8 @@ NUM_CONTACTS = 8
 ABSENT = 1.0
 """Distance of a slot without a contact (m)."""
 
-_Scalar, _Vector, _Matrix = Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]
+_Vector = Float[Array, "3"]
+_Matrix = Float[Array, "3 3"]
 _Contacts = tuple[Float[Array, "8"], Float[Array, "8 3"], _Vector]
 # Relative amount by which an edge axis must beat a face axis, and the one where it is within 8 degrees of that axis.
 _EDGE_BIAS, _ALIKE_BIAS, _ALIKE = 1e-6, 0.05, 0.99
@@ -128,7 +129,7 @@ def _others(x: _Vector) -> _Matrix:
 def _faces(first: Box, second: Box, turn: _Matrix, ways: tuple[_Vector, _Vector], axis: _Axis) -> _Contacts:
     """Return distances, positions and the normal where the axis belongs to a face."""
     is_second = axis.face >= 3
-    box, other = (Box(*(jnp.where(is_second, y, x) for x, y in zip(*p))) for p in ((first, second), (second, first)))
+    box, other = (jax.tree.map(lambda x, y: jnp.where(is_second, y, x), *p) for p in ((first, second), (second, first)))
     # Coordinates from here on: two axes of the clipping face, and the height above it.
     cycle = jnp.asarray(_CYCLES, turn.dtype)[axis.face % 3]
     turn, way = _product(cycle, jnp.where(is_second, turn.T, turn)), _product(cycle, jnp.where(is_second, *ways[::-1]))
@@ -167,9 +168,7 @@ def _clipped(
     is_parallel = slope < _PARALLEL
     steep, flat = jnp.where(is_steep, dx, 1.0), jax.lax.stop_gradient(jnp.where(is_parallel, 1.0, dx))
     # Where each edge passes both limits of each coordinate, as a share of its length.
-    passes = []
-    for to in (-limit - x, limit - x):
-        passes.append(jnp.where(is_steep, to / steep, jax.lax.stop_gradient(to) / flat))
+    passes = [jnp.where(is_steep, way / steep, jax.lax.stop_gradient(way) / flat) for way in (-limit - x, limit - x)]
     between = jnp.abs(x) <= limit
     enter = jnp.max(jnp.where(is_parallel, jnp.where(between, -1.0, 2.0), jnp.minimum(*passes)), axis=1)
     leave = jnp.min(jnp.where(is_parallel, jnp.where(between, 2.0, -1.0), jnp.maximum(*passes)), axis=1)
@@ -215,7 +214,8 @@ def _edges(first: Box, second: Box, turn: _Matrix, way: _Vector, axis: _Axis) ->
     gap = mid2 - mid1
     half1, half2 = jnp.sum(along1 * first.half), jnp.sum(at2 * second.half)
     cosine, gap1, gap2 = jnp.sum(along1 * along2), jnp.sum(along1 * gap), jnp.sum(along2 * gap)
-    s = jnp.clip((gap1 - cosine * gap2) / square, -half1, half1)
+    # The same as (gap1 - cosine gap2) / square, without a difference of numbers that are nearly equal.
+    s = jnp.clip(jnp.sum(jnp.cross(gap, along2) * cross) / square, -half1, half1)
     t = jnp.clip(cosine * s - gap2, -half2, half2)
     s = jnp.clip(gap1 + cosine * t, -half1, half1)
     point1, point2 = mid1 + s * along1, mid2 + t * along2

@@ -224,7 +224,8 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.F
 def _box_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
     """Return contacts of boxes; see `boxes`."""
     first, second = (
-        boxes.Box(pick(geom, data.geom_xpos), pick(geom, data.geom_xmat), pick(geom, model.geom_size)) for geom in geoms.T
+        boxes.Box(pick(geom, data.geom_xpos), pick(geom, data.geom_xmat), pick(geom, model.geom_size))
+        for geom in geoms.T
     )
     dist, pos, frame = jax.vmap(boxes.box_box)(first, second)
     return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)

@@ -75,7 +75,9 @@ def test_two_boxes_touch_where_they_do_in_c(margin):
 def test_a_square_turned_on_a_square_touches_at_an_octagon():
     """A square of side 2 turned by 45° within another: corners at (±1, ±(√2 - 1)) and the same exchanged."""
     half, turn = jnp.array([1.0, 1.0, 0.25]), np.sqrt(0.5) * np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]])
-    dist, pos, frame = box_box(Box(jnp.zeros(3), jnp.eye(3), half), Box(jnp.array([0, 0, 0.49]), jnp.asarray(turn), half))
+    dist, pos, frame = box_box(
+        Box(jnp.zeros(3), jnp.eye(3), half), Box(jnp.array([0, 0, 0.49]), jnp.asarray(turn), half)
+    )
     near = np.sqrt(2) - 1
     corners = [(x, y) for x in (-1, 1) for y in (-near, near)]
     expected = sorted((x, y, 0.245) for x, y in corners + [(y, x) for x, y in corners])
@@ -135,7 +137,9 @@ def test_derivatives_are_finite_in_single_precision():
     motions = tilts[:, None] * np.concatenate([np.zeros((1, 3)), np.random.default_rng(1).normal(size=(5, 3))])[:, None]
     motions = np.concatenate([np.zeros_like(motions), motions], axis=2).reshape(-1, 6)
     half = jnp.full((2, 3), 0.1, jnp.float32)
-    starts = [(np.array([[0, 0, 0], place]), np.stack([np.eye(3)] * 2)) for place in ([0, 0, 0.19], [0.2, 0, 0.2], [0.2] * 3)]
+    starts = [
+        (np.array([[0, 0, 0], place]), np.stack([np.eye(3)] * 2)) for place in ([0, 0, 0.19], [0.2, 0, 0.2], [0.2] * 3)
+    ]
     starts += [_crossing(yaw) for yaw in (0, np.pi / 2)]
     with jax.enable_x64(False):
 
