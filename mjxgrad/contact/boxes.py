@@ -115,7 +115,7 @@ def _separating_axis(turn: _Matrix, ways: tuple[_Vector, _Vector], half1: _Vecto
     pair = jnp.argmax(is_better & (edges >= of_edge - _EDGE_BIAS * jnp.abs(of_edge)))
     edge = pair // 3, pair % 3
     axes = jnp.concatenate([jnp.eye(3, dtype=turn.dtype), turn.T])
-    cosine = jnp.abs(jnp.dot(jnp.cross(axes[edge[0]], turn[:, edge[1]]), axes[face])) / sine[edge]
+    cosine = jnp.abs(jnp.sum(jnp.cross(axes[edge[0]], turn[:, edge[1]]) * axes[face])) / sine[edge]
     is_alike = (cosine > _ALIKE) & (edges[pair] < of_face + _ALIKE_BIAS * jnp.abs(of_face) + 1e-15)
     return _Axis(face, jnp.any(is_better) & ~is_alike, edge)
 
@@ -133,14 +133,14 @@ def _faces(first: Box, second: Box, turn: _Matrix, ways: tuple[_Vector, _Vector]
     # Coordinates from here on: two axes of the clipping face, and the height above it.
     cycle = jnp.asarray(_CYCLES, turn.dtype)[axis.face % 3]
     turn, way = _product(cycle, jnp.where(is_second, turn.T, turn)), _product(cycle, jnp.where(is_second, *ways[::-1]))
-    side = jnp.where(way[2] >= 0, 1.0, -1.0).astype(turn.dtype)
-    upright = jnp.stack([jnp.ones_like(side), jnp.ones_like(side), side])
+    side, is_height = jnp.where(way[2] >= 0, 1.0, -1.0), np.arange(3) == 2
+    upright = jnp.where(is_height, side, 1.0)
     half = _product(cycle, box.half)
     # Columns: both axes of the face that is clipped, then its normal, against that of the clipping face.
     columns = jnp.asarray(_CYCLES, turn.dtype)[jnp.argmax(jnp.abs(turn[2]))]
     spans = upright[:, None] * _product(turn, columns.T) * _product(columns, other.half)
     below = jnp.where(spans[2, 2] > 0, -1.0, 1.0)
-    middle = upright * way + below * spans[:, 2] - jnp.array([0.0, 0.0, 1.0]) * half
+    middle = upright * way + below * spans[:, 2] - jnp.where(is_height, half, 0.0)
     points, is_corner = _clipped(middle, spans[:, :2].T, half[:2])
     points, is_corner = _packed(points, is_corner, half[:2])
     local = jnp.concatenate([points[:, :2], side * (half[2] + 0.5 * points[:, 2:])], axis=1)
