@@ -97,11 +97,9 @@ def _separating_axis(turn: _Matrix, ways: tuple[_Vector, _Vector], half1: _Vecto
     """Return the axis along which the boxes are farthest apart, or overlap least; it has no derivative."""
     turn, (way, back), half1, half2 = jax.lax.stop_gradient((turn, ways, half1, half2))
     size = jnp.abs(turn)
-    faces = jnp.concatenate(
-        [jnp.abs(way) - half1 - _product(size, half2), jnp.abs(back) - half2 - _product(size.T, half1)]
-    )
-    face = jnp.argmax(faces)
-    of_face = jnp.max(faces)
+    of_first, of_second = half1 + _product(size, half2), half2 + _product(size.T, half1)
+    faces = jnp.concatenate([jnp.abs(way) - of_first, jnp.abs(back) - of_second])
+    face, of_face = jnp.argmax(faces), jnp.max(faces)
     # Edge i across edge j has the axis e_i × t_j / sine, t_j a column of the turn; its components are entries of the turn.
     square = _product(1.0 - jnp.eye(3, dtype=turn.dtype), turn * turn)
     is_axis = square > (1e-16 if turn.dtype == jnp.float64 else 1e-7)
@@ -141,8 +139,7 @@ def _faces(first: Box, second: Box, turn: _Matrix, ways: tuple[_Vector, _Vector]
     spans = upright[:, None] * _product(turn, columns.T) * _product(columns, other.half)
     below = jnp.where(spans[2, 2] > 0, -1.0, 1.0)
     middle = upright * way + below * spans[:, 2] - jnp.where(is_height, half, 0.0)
-    points, is_corner = _clipped(middle, spans[:, :2].T, half[:2])
-    points, is_corner = _packed(points, is_corner, half[:2])
+    points, is_corner = _packed(*_clipped(middle, spans[:, :2].T, half[:2]), half[:2])
     local = jnp.concatenate([points[:, :2], side * (half[2] + 0.5 * points[:, 2:])], axis=1)
     world = _product(box.axes, cycle.T)
     normal = jnp.where(is_second, -side, side) * world[:, 2]
@@ -164,8 +161,7 @@ def _clipped(
     x, dx, limit = start[:, :2], step[:, :2], half * (1 + slack)
     is_inside = jnp.all(jnp.abs(x) <= limit, axis=1)
     slope = jnp.abs(jax.lax.stop_gradient(dx))
-    is_steep = slope > _FLAT * jnp.max(slope, axis=1, keepdims=True)
-    is_parallel = slope < _PARALLEL
+    is_steep, is_parallel = slope > _FLAT * jnp.max(slope, axis=1, keepdims=True), slope < _PARALLEL
     steep, flat = jnp.where(is_steep, dx, 1.0), jax.lax.stop_gradient(jnp.where(is_parallel, 1.0, dx))
     # Where each edge passes both limits of each coordinate, as a share of its length.
     passes = [jnp.where(is_steep, way / steep, jax.lax.stop_gradient(way) / flat) for way in (-limit - x, limit - x)]
@@ -196,7 +192,7 @@ def _packed(
     is_new = is_corner & ~jnp.any(is_same & is_corner[None] & (order[:, None] > order), axis=1)
     slot = jnp.cumsum(is_new) - 1
     chosen = is_new & (slot == jnp.arange(NUM_CONTACTS)[:, None])
-    return jnp.sum(jnp.where(chosen[..., None], points, 0.0), axis=1), jnp.any(chosen, axis=1)
+    return jnp.sum(jnp.where(chosen[..., None], points, 0.0), axis=1), chosen.any(axis=1)
 
 
 def _edges(first: Box, second: Box, turn: _Matrix, way: _Vector, axis: _Axis) -> _Contacts:
