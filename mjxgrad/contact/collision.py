@@ -1,12 +1,12 @@
 """Contacts between geoms: MJX's pairs and slots, and some of its functions.
 
-Contacts of planes, balls and capsules are in `capsules`. Five more kinds of pair differ from MJX.
+Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`. Five more kinds of pair differ from MJX.
 
 A box on a plane. MJX searches corners within 1 mm of the deepest one. A tilted box loses corners that still touch, and its
 contacts change places as it turns. C MuJoCo and this library take the lower end of each of the four diagonals. No search is
 needed, and a contact always belongs to the same diagonal.
 
-Two faces, of boxes or meshes. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
+Two faces, one of them of a mesh. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
 For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.
 
 A ball on a box. MJX knows the distance only where they overlap; the nearest point of a box is known everywhere.
@@ -22,7 +22,7 @@ the rim above the plane, and its derivative is correct in every pose.
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, SupportsInt
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from mjxgrad._mjx import contact_groups, custom_number, geom_groups, make_frame,
 from mjxgrad.batched import maps
 from mjxgrad.batched.maps import contract, dot, pick, safe_norm
 from mjxgrad.bodies.mended import copy_of
-from mjxgrad.contact import capsules
+from mjxgrad.contact import boxes, capsules
 
 _PerPair = Float[Array, " pairs"]
 _Frames = Float[Array, "pairs 3 3"]
@@ -59,7 +59,7 @@ _ALIGNED = 1e-5
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Fill in the contacts; a drop-in for `mjx.collision`, with the same number of contacts and order of pairs.
+    """Fill in the contacts; a drop-in for `mjx.collision`, with the same order of pairs.
 
     Where data has fewer slots for contacts of one dimension than there could be contacts, the nearest ones get them.
     """
@@ -84,6 +84,9 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         dist, pos, frame = found[key] if key in found else find(model, data, key, geoms)
         count = len(dist) // len(geoms)
         contact = jax.tree.map(lambda x, count=count: jnp.repeat(x, count, axis=0), contacts[key])
+        if key.types == (_BOX, _BOX):
+            # Beyond the margin C MuJoCo has no contact, and other code takes it that the distance is not known.
+            dist = jnp.where(dist > contact.includemargin, boxes.ABSENT, dist)
         by_dim.setdefault(int(key.condim), []).append(contact.replace(dist=dist, pos=pos, frame=frame))
     ordered = []
     for dim in sorted(by_dim):
@@ -106,9 +109,27 @@ def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
     """Return the two geoms of each possible contact, by dimension."""
     by_dim: dict[int, list[np.ndarray]] = {}
     for key, members in geom_groups(model).items():
-        count = _MJX_FUNCTIONS[key.types].ncon  # pyright: ignore[reportArgumentType]
-        by_dim.setdefault(int(key.condim), []).append(np.repeat(np.array(members)[:, :2], count, axis=0))
+        found = np.repeat(np.array(members)[:, :2], most_contacts(key.types), axis=0)
+        by_dim.setdefault(int(key.condim), []).append(found)
     return {dim: np.concatenate(geoms) for dim, geoms in by_dim.items()}
+
+
+def most_contacts(kinds: tuple[SupportsInt, SupportsInt]) -> int:
+    """Return the largest number of contacts of a pair of geoms of two types."""
+    first, second = map(int, kinds)
+    return boxes.NUM_CONTACTS if (first, second) == (_BOX, _BOX) else _MJX_FUNCTIONS[first, second].ncon  # pyright: ignore
+
+
+def slot_dims(model: mjx.Model) -> Int[np.ndarray, " contacts"]:
+    """Return the friction dimension of each contact slot, with the limits that a scene sets for MJX."""
+    most_pairs, most_points = (custom_number(model, f"max_{name}") for name in ("geom_pairs", "contact_points"))
+    counts: dict[int, int] = {}
+    for key, members in geom_groups(model).items():
+        is_limited = most_pairs > -1 and not _WITHOUT_BROAD_PHASE & set(key.types)
+        num_pairs = min(len(members), most_pairs) if is_limited else len(members)
+        count = counts.get(int(key.condim), 0) + num_pairs * most_contacts(key.types)
+        counts[int(key.condim)] = min(count, most_points) if most_points > -1 else count
+    return np.repeat(sorted(counts), [counts[dim] for dim in sorted(counts)]).astype(int)
 
 
 def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
@@ -200,6 +221,16 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.F
     return dist.reshape(-1), pos.reshape(-1, 3), frame
 
 
+def _box_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
+    """Return contacts of boxes; see `boxes`."""
+    first, second = (
+        boxes.Box(pick(geom, data.geom_xpos), pick(geom, data.geom_xmat), pick(geom, model.geom_size))
+        for geom in geoms.T
+    )
+    dist, pos, frame = jax.vmap(boxes.box_box)(first, second)
+    return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
+
+
 def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> capsules.Found:
     """Return MJX's contacts, with the derivative of the distance that MJX drops."""
     dist, pos, frame = _MJX_FUNCTIONS[key.types](model, data, key, geoms)
@@ -273,6 +304,7 @@ _FUNCTIONS = {
     (_PLANE, _CYLINDER): _plane_cylinder,
     (_SPHERE, _BOX): _sphere_box,
     (_SPHERE, _CYLINDER): _sphere_cylinder,
+    (_BOX, _BOX): _box_box,
 }
 
 
@@ -329,9 +361,7 @@ _convex = copy_of(
 )
 _convex._create_contact_manifold = partial(_half_way, _convex._create_contact_manifold)
 # MJX decides between faces and edges by the distances of all four: repeated contacts are marked after that.
-_convex._box_box_impl, _convex._sat_gaussmap = (
-    partial(_once, f) for f in (_convex._box_box_impl, _convex._sat_gaussmap)
-)
+_convex._sat_gaussmap = partial(_once, _convex._sat_gaussmap)
 _own = {f: getattr(_convex, name) for name, f in vars(sys.modules[_convex.__name__]).items() if hasattr(f, "ncon")}
-# MJX's function for each pair of types; those of boxes, capsules, meshes and height fields are copies with safe quotients.
+# MJX's function for each pair of types; those of capsules, meshes and height fields are copies with safe quotients.
 _MJX_FUNCTIONS = {kinds: _own.get(f, f) for kinds, f in _PLAIN.items()}

@@ -20,9 +20,9 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad._mjx import COLLISION_FUNCTIONS
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.contact.bounce import Bounce
+from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
@@ -346,7 +346,7 @@ def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
             str(pair),
             *springiness,
             size=_thickness(scene, pair),
-            num_rows=COLLISION_FUNCTIONS[kinds].ncon,
+            num_rows=most_contacts(kinds),
             pyramid=float(friction[i]) if has_edges else None,
             speed=speed,
         )

@@ -20,6 +20,7 @@ import numpy as np
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
+from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene.conversions import (
     AFTER_REFUSALS,
@@ -276,17 +277,19 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
 
 
 def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:
-    """Return MJX's data with contact slots, including frictionless ones beside elliptic ones, which MJX refuses."""
+    """Return MJX's data with contact slots, including frictionless ones beside elliptic ones, which MJX refuses.
+
+    A pair of boxes has more of them than in MJX.
+    """
     cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
     data = mjx.make_data(model, impl="jax", device=own_device())
     model.opt.cone = cone
-    dims = np.asarray(data._impl.contact.dim)
-    of_dim = [np.flatnonzero(dims == dim)[:max_contacts] for dim in np.unique(dims)]
-    kept = np.concatenate([np.zeros(0, int), *of_dim])
-    if cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and len(kept) == len(dims):
+    dims = slot_dims(mjx_model) if data._impl.ncon else np.zeros(0, int)
+    dims = np.concatenate([np.zeros(0, int), *(dims[dims == dim][:max_contacts] for dim in np.unique(dims))])
+    if cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and np.array_equal(dims, data._impl.contact.dim):
         return data
-    dims = dims[kept]
-    contact = jax.tree.map(lambda x: x[kept], data._impl.contact)
+    # All slots of MJX's data are alike.
+    contact = jax.tree.map(lambda x: x[np.zeros(len(dims), int)], data._impl.contact)
     efc_type = make_efc_type(mjx_model, dims)
     num_equality, num_friction, num_limit, _ = found = counts(efc_type)
     num_rows = sum(found)
@@ -300,7 +303,7 @@ def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | 
         "_impl.nf": num_friction,
         "_impl.nl": num_limit,
         "_impl.nefc": num_rows,
-        "_impl.ncon": len(kept),
+        "_impl.ncon": len(dims),
         "_impl.efc_type": efc_type,
         "_impl.contact": contact.replace(dim=dims, efc_address=make_efc_address(mjx_model, dims, efc_type)),
     }
