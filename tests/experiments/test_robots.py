@@ -55,8 +55,9 @@ def test_motion_and_derivatives_are_those_of_c_mujoco(kind, tmp_path):
     scene = mg.load_scene(model)
     found = robots.one_step(model, scene, "mujoco")
     assert robots.failures("c_double", found | {"warned": False}) == []
-    # Which edges of the cylinder touch changes from step to step, so that 33 starts do not tell.
-    assert robots.many_steps(model, scene)["steps"] in ("right", "consistent")[: 1 + ("cylinder" in kind)]
+    # Which edges of the cylinder touch changes from step to step: its derivatives scatter, which is said.
+    told = robots.many_steps(model, scene)["steps"]
+    assert told == "right" or ("cylinder" in kind and told in ("consistent", "flagged"))
 
 
 def test_the_slope_of_rk4_knows_that_each_of_its_stages_may_touch():
