@@ -37,7 +37,7 @@ def test_the_search_begins_at_the_nominal_values_and_stays_within_the_bounds():
     np.testing.assert_allclose(values[0], [0.5, 1.0, -11.0, -1.4, 0.5])
     np.testing.assert_allclose(values[60], [4.0, 9.0, 1.0, 2.8, 4.5])
     np.testing.assert_array_equal(coordinates.is_at_bound(values[0]), [True, True, False, False, True])
-    np.testing.assert_array_equal(coordinates.is_at_bound(values[60]), [True, False, False, False, True])
+    np.testing.assert_array_equal(coordinates.is_at_bound(values[60]), [True, False, True, False, True])
 
 
 def test_makers_write_what_they_say(scene):
