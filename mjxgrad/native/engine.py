@@ -26,7 +26,7 @@ _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
-_RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, while something touches
+_RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
 _TOLERANCE, _ITERATIONS = 1e-14, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 
@@ -219,7 +219,7 @@ class _Linearisation:
                 felt = near.events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
                 rest[:nv] -= near.events.moves @ felt
                 moved += spanned @ felt
-            if near is not None and near.touches:
+            if near is not None and near.is_rough:
                 moved += self._along(model, clear, rest[:nv], near)
                 rest[:nv] = 0.0
             width = self._width(near) / max(np.abs(rest).max(), np.abs(push).max(initial=0.0), 1e-30)
@@ -249,7 +249,7 @@ class _Linearisation:
             rest -= events.moves @ events.rows
             jumps = spanned - matrix[:, :nv] @ events.moves
             matrix[:, nv : 2 * nv] += self.surfaces.lead * jumps @ events.rows
-        if near.touches:
+        if near.is_rough:
             for column, direction in enumerate(rest.T):
                 matrix[:, column] = self._along(model, clear, direction, near)
         else:
@@ -273,7 +273,7 @@ class _Linearisation:
 
         The stages of Runge-Kutta have other positions at other velocities, and would meet surfaces.
         """
-        return _WIDTH if near is None or not near.touches or self.surfaces.lead else _RUBBING
+        return _WIDTH if near is None or not near.is_rough or self.surfaces.lead else _RUBBING
 
     def _near(
         self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray

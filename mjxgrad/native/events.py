@@ -21,9 +21,9 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
   Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
   moved together, as one.
-- **Geometry.** Where contacts act, A₀ is by displacements along 1 - P J that move a body's farthest point by 0.06 mm, not by
-  small ones: the lowest point of a cylinder that stands, or of a mesh that lies, runs along its rim at tilts of rounding size,
-  and a derivative of that multiplied motions by 1e30 in fifty steps.
+- **Geometry.** Where bodies with edges or corners touch, A₀ is by displacements along 1 - P J that move a body's farthest point
+  by 0.06 mm, not by small ones: the lowest point of a cylinder that stands, or of a mesh that lies, runs along its rim at tilts
+  of rounding size, and a derivative of that multiplied motions by 1e30 in fifty steps.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
   Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
   an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
@@ -49,10 +49,12 @@ _NO_JUMP = 0.01  # impedance from which force begins without a jump worth the na
 _USUAL_WIDTH = 1e-3  # m or rad; wider impedances, of soft limits, reach states that come to no surface
 # Rows count as independent if nothing need move farther than so many times the gap to change one alone.
 _FARTHEST = 10.0
+_SMOOTH = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
 _LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT.value, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON.value)
 
 _Rows = Float[np.ndarray, "rows nv"]
 _PerRow = Float[np.ndarray, " rows"]
+_Mask = Bool[np.ndarray, " rows"]
 
 
 @dataclass(frozen=True)
@@ -80,14 +82,14 @@ class Near:
 
     Attributes:
         events: those that the step may begin or end, or None.
-        touches: whether a contact acts, or may.
+        is_rough: whether a contact acts, or may, at a body with edges or corners.
         rows: J of the others.
         gaps: gaps of the others (m or rad).
         lengths: how far each joint velocity moves the farthest point of its bodies (m or 1).
     """
 
     events: Events | None
-    touches: bool
+    is_rough: bool
     rows: Float[np.ndarray, "others nv"]
     gaps: Float[np.ndarray, " others"]
     lengths: Float[np.ndarray, " nv"]
@@ -113,6 +115,8 @@ class Surfaces:
         least = _LEAST_WIDTH * _USUAL_WIDTH
         self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
         self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
+        # The last entry is for -1, the vertices of flexible bodies.
+        self.is_rough = np.append(~np.isin(model.geom_type, _SMOOTH), False)
         self.model = far = copy.deepcopy(model)
         far.geom_margin[:] += self.contact_reach / 2
         far.flex_margin[:] += self.contact_reach / 2
@@ -129,22 +133,22 @@ class Surfaces:
         mujoco.mj_fwdPosition(self.model, data)
         if not data.nefc:
             return None
-        num_contacts, rows, gaps, least, jumps = self._gaps(data)
+        is_rough, rows, gaps, least, jumps = self._gaps(data)
         rate, centres = rows @ before, np.zeros(len(rows))
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
         if self.lead:
             # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
             centres, widths = -self.lead * rate, _STAGES * widths
         widths = np.maximum(widths, least)
-        touches = bool(np.any((gaps - centres < widths)[:num_contacts]))
+        is_rough &= gaps - centres < widths
         chosen = (np.abs(gaps - centres) < widths) & jumps
         events = None
         if chosen.any():
             events = _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
-        return Near(events, touches, rows[~chosen], gaps[~chosen], self.lengths)
+        return Near(events, bool(is_rough.any()), rows[~chosen], gaps[~chosen], self.lengths)
 
-    def _gaps(self, data: mujoco.MjData) -> tuple[int, _Rows, _PerRow, _PerRow, Bool[np.ndarray, " rows"]]:
-        """Return how many contacts come first, and J, gap, least width, and whether force jumps, of contacts and limits."""
+    def _gaps(self, data: mujoco.MjData) -> tuple[_Mask, _Rows, _PerRow, _PerRow, _Mask]:
+        """Return of contacts and limits whether they are rough, J, gap, least width, and whether force jumps."""
         model, jacobian = self.model, data.efc_J.reshape(-1, self.model.nv)
         contact = data.contact
         first = np.asarray(contact.efc_address)
@@ -164,8 +168,10 @@ class Surfaces:
         first_impedance, _, width, *_ = np.concatenate(solimp).T
         width = np.where(width > 0, np.minimum(width, _USUAL_WIDTH), _USUAL_WIDTH)
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
+        is_rough = np.zeros(len(address), bool)
+        is_rough[: len(first)] = self.is_rough[np.asarray(contact.geom).reshape(-1, 2)[acts]].any(axis=1)
         return (
-            len(first),
+            is_rough,
             rows,
             data.efc_pos[address] - data.efc_margin[address] + margin,
             _LEAST_WIDTH * width,
