@@ -21,9 +21,9 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
   Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
   moved together, as one.
-- **Geometry.** Where bodies with edges or corners touch, A₀ is by displacements along 1 - P J that move a body's farthest point
-  by 0.06 mm, not by small ones: the lowest point of a cylinder that stands, or of a mesh that lies, runs along its rim at tilts
-  of rounding size, and a derivative of that multiplied motions by 1e30 in fifty steps.
+- **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.
+  The lowest point of a standing cylinder, or a lying mesh, runs along its rim at tilts of the size of rounding.
+  Small differences see that, and multiplied motions by 1e30 in fifty steps.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
   Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
   an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
@@ -83,8 +83,8 @@ class Near:
     Attributes:
         events: those that the step may begin or end, or None.
         is_rough: whether a contact acts, or may, at a body with edges or corners.
-        rows: J of the others.
-        gaps: gaps of the others (m or rad).
+        rows: J of the other contacts and limits whose force begins with a jump.
+        gaps: their gaps (m or rad).
         lengths: how far each joint velocity moves the farthest point of its bodies (m or 1).
     """
 
@@ -145,7 +145,8 @@ class Surfaces:
         events = None
         if chosen.any():
             events = _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
-        return Near(events, bool(is_rough.any()), rows[~chosen], gaps[~chosen], self.lengths)
+        others = jumps & ~chosen  # a force that begins without a jump may be crossed
+        return Near(events, bool(is_rough.any()), rows[others], gaps[others], self.lengths)
 
     def _gaps(self, data: mujoco.MjData) -> tuple[_Mask, _Rows, _PerRow, _PerRow, _Mask]:
         """Return of contacts and limits whether they are rough, J, gap, least width, and whether force jumps."""

@@ -252,3 +252,13 @@ def test_a_cloth_that_lands_has_the_slope_as_mean():
     found = compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
     assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope))
     assert np.all(found.mean_error[0] < 0.2 * np.abs(found.slope).max())
+
+
+def test_a_soft_limit_at_its_surface_does_not_narrow_differences():
+    """Force without a jump may be crossed: a width of zero would give NaN."""
+    scene = mg.load_scene(
+        """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .0999"><joint type="slide" axis="0 0 1" range="0 1"
+        limited="true" solimplimit="0 .9 .01"/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>""",
+        engine="mujoco",
+    )
+    assert np.isfinite(mg.linearise(scene, mg.initial_state(scene), contact=mg.Slope()).A).all()
