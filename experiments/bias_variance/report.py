@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.ticker import NullLocator, SymmetricalLogLocator
 
+import mjxgrad as mg
 from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
 from experiments.bias_variance.settings import ThrowsSettings
