@@ -17,7 +17,7 @@ anywhere: the place of such a cut on its edge is a constant to the derivative.
 References:
     Gottschalk, Lin, Manocha. OBBTree: a hierarchical structure for rapid interference detection. SIGGRAPH 1996.
     Liang, Barsky. A new concept and method for line clipping. ACM Transactions on Graphics 3, 1984.
-    The behaviour is that of `mjc_BoxBox` in MuJoCo's `engine_collision_box.c`, measured; the formulas are our own.
+    MuJoCo's `engine_collision_box.c` (`mjc_BoxBox`), from which the thresholds are; formulas and code are our own.
 """
 
 from typing import NamedTuple

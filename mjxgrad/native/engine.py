@@ -220,7 +220,7 @@ class _Linearisation:
                 rest[:nv] -= near.events.moves @ felt
                 moved += spanned @ felt
             if near is not None and near.is_rough:
-                moved += self._along(model, clear, rest[:nv], near)
+                moved += self._visibly(model, clear, rest[:nv], near)
                 rest[:nv] = 0.0
             width = self._width(near) / max(np.abs(rest).max(), np.abs(push).max(initial=0.0), 1e-30)
             sides = []
@@ -247,26 +247,30 @@ class _Linearisation:
         matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
         if events is not None:
             rest -= events.moves @ events.rows
-            jumps = spanned - matrix[:, :nv] @ events.moves
-            matrix[:, nv : 2 * nv] += self.surfaces.lead * jumps @ events.rows
+            if self.surfaces.lead:
+                jumps = spanned - matrix[:, :nv] @ events.moves
+                matrix[:, nv : 2 * nv] += self.surfaces.lead * jumps @ events.rows
         if near.is_rough:
-            for column, direction in enumerate(rest.T):
-                matrix[:, column] = self._along(model, clear, direction, near)
-        else:
+            matrix[:, :nv] = np.transpose([self._visibly(model, clear, change, near) for change in rest.T])
+        elif events is not None:
             matrix[:, :nv] = matrix[:, :nv] @ rest
         if events is not None:
             matrix[:, :nv] += spanned @ events.rows
 
-    def _along(
+    def _visibly(
         self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray, near: Near
     ) -> Float[np.ndarray, " size"]:
         """Return the derivative along a displacement, by as much as moves surfaces visibly."""
         if np.abs(change).max() < _NOTHING:  # what an event leaves of a coordinate that moves it alone
             return np.zeros(2 * model.nv + model.na)
-        width = near.width(change)
-        return self._difference(model, *(self._moved(model, row, side * width * change) for side in (1, -1))) / (
-            2 * width
-        )
+        return self._along(model, row, change, near.width(change))
+
+    def _along(
+        self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray, width: float
+    ) -> Float[np.ndarray, " size"]:
+        """Return the derivative along a change of the state, by a central difference."""
+        ends = [self._moved(model, row, side * width * change) for side in (1, -1)]
+        return self._difference(model, *ends) / (2 * width)
 
     def _width(self, near: Near | None) -> float:
         """Return the width of differences by all but positions: under friction, small ones see what comes of rounding.
@@ -304,10 +308,7 @@ class _Linearisation:
         Accelerations move the stages, so that their places are not known beforehand.
         """
         for _ in range(4):
-            near, far = (
-                self._difference(model, *(self._moved(model, row, side * width * change) for side in (1, -1))) / width
-                for width in (1, 4)
-            )
+            near, far = (self._along(model, row, change, width) for width in (1.0, 4.0))
             if np.linalg.norm(near - far) <= 0.1 * np.linalg.norm(far):
                 break
             row = self._moved(model, row, 8 * change)
@@ -346,8 +347,7 @@ class _Linearisation:
 
     def _by_columns(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
         for column, change in enumerate(np.eye(len(found["state"]))):
-            ends = [self._moved(model, row, side * width * change) for side in (1, -1)]
-            found["state"][:, column] = self._difference(model, *ends) / (2 * width)
+            found["state"][:, column] = self._along(model, row, change, width)
             if "C" in found:
                 found["C"][:, column] = self.sensed / (2 * width)
 
