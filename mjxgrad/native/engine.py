@@ -14,7 +14,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad.native.events import Events, Near, Surfaces, levers_of
+from mjxgrad.native.events import Events, Near, Surfaces, levers_of, undecided
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
 
@@ -205,15 +205,14 @@ class _Linearisation:
     @np.errstate(invalid="ignore", over="ignore")
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
-        plain, model = self.models
-        assert model is not None
+        plain = self.models[0]
         parts, row, change = [self.places[name] for name in START[1:]], row.copy(), change.copy()
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            near, spanned, clear = self._near(model, row, ends[1])
+            model, near, spanned, clear = self._near(self.models[1], row, ends[1])
             nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
             if near is not None and near.events is not None:
                 felt = near.events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
@@ -240,7 +239,7 @@ class _Linearisation:
         if not np.isfinite(after).all():
             return
         row[self.places["warmstart"]] = self.data.qacc_warmstart
-        near, spanned, clear = self._near(model, row, after)
+        model, near, spanned, clear = self._near(model, row, after)
         self._small(model, clear, found, self._width(near))
         if near is None:
             return
@@ -281,17 +280,19 @@ class _Linearisation:
 
     def _near(
         self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
-    ) -> tuple[Near | None, np.ndarray, np.ndarray]:
-        """Return what is near, D of what a step may begin or end, and the state about which differences cross no surface."""
+    ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
+        """Return the model to take differences of, what is near, D, and the state about which differences cross no surface."""
         near, nothing = None, np.zeros((0, 0))
         if self.gradient == "slope" and np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
             near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
+        if near is not None and near.is_undecided:
+            model = min(undecided(model), key=lambda one: np.abs(self._step(one, row)[1] - after).max())
         if near is None or near.events is None:
-            return near, nothing, row
+            return model, near, nothing, row
         spanned = self._spanned(model, row, events := near.events)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
-            return dataclasses.replace(near, events=None), nothing, row
+            return model, dataclasses.replace(near, events=None), nothing, row
         least, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
         off = events.gaps - surfaces
         off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
@@ -300,7 +301,7 @@ class _Linearisation:
         if self.surfaces.lead:
             for move, width in zip(events.moves.T, least / 4, strict=True):
                 clear = self._off_stages(model, clear, width * move)
-        return near, spanned, clear
+        return model, near, spanned, clear
 
     def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.

@@ -24,6 +24,8 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
 - **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.
   The lowest point of a standing cylinder, or a lying mesh, runs along its rim at tilts of the size of rounding.
   Small differences see that, and multiplied motions by 1e30 in fifty steps.
+- **Undecided.** A gap that no coordinate moves and that is zero to rounding (a robot that slides in a plane on the floor) opens
+  and closes at random. Differences are then taken with margins by which it stays as it was in the step itself.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
   Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
   an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
@@ -49,6 +51,7 @@ _NO_JUMP = 0.01  # impedance from which force begins without a jump worth the na
 _USUAL_WIDTH = 1e-3  # m or rad; wider impedances, of soft limits, reach states that come to no surface
 # Rows count as independent if nothing need move farther than so many times the gap to change one alone.
 _FARTHEST = 10.0
+_ROUNDING = 1e-9  # m or rad, of gaps
 _SMOOTH = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
 _LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT.value, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON.value)
 
@@ -83,6 +86,7 @@ class Near:
     Attributes:
         events: those that the step may begin or end, or None.
         is_rough: whether a contact acts, or may, at a body with edges or corners.
+        is_undecided: whether rounding decides if a contact or limit acts.
         rows: J of the other contacts and limits whose force begins with a jump.
         gaps: their gaps (m or rad).
         lengths: how far each joint velocity moves the farthest point of its bodies (m or 1).
@@ -90,6 +94,7 @@ class Near:
 
     events: Events | None
     is_rough: bool
+    is_undecided: bool
     rows: Float[np.ndarray, "others nv"]
     gaps: Float[np.ndarray, " others"]
     lengths: Float[np.ndarray, " nv"]
@@ -117,14 +122,8 @@ class Surfaces:
         self.limit_reach = float(travel.sum() * max(1.0, self.lengths.max())) + least
         # The last entry is for -1, the vertices of flexible bodies.
         self.is_rough = np.append(~np.isin(model.geom_type, _SMOOTH), False)
-        self.model = far = copy.deepcopy(model)
-        far.geom_margin[:] += self.contact_reach / 2
-        far.flex_margin[:] += self.contact_reach / 2
-        far.pair_margin[:] += self.contact_reach
-        far.opt.o_margin += self.contact_reach
-        far.jnt_margin[:] += self.limit_reach
-        far.tendon_margin[:] += self.limit_reach
-        far.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        self.model = widened(model, self.contact_reach, self.limit_reach)
+        self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
     def near(
         self, data: mujoco.MjData, before: Float[np.ndarray, " nv"], after: Float[np.ndarray, " nv"]
@@ -141,12 +140,15 @@ class Surfaces:
             centres, widths = -self.lead * rate, _STAGES * widths
         widths = np.maximum(widths, least)
         is_rough &= gaps - centres < widths
+        is_moved = np.linalg.norm(rows / self.lengths, axis=1) > 1 / _FARTHEST
+        is_undecided = jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)
+        jumps &= is_moved
         chosen = (np.abs(gaps - centres) < widths) & jumps
         events = None
         if chosen.any():
             events = _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
         others = jumps & ~chosen  # a force that begins without a jump may be crossed
-        return Near(events, bool(is_rough.any()), rows[others], gaps[others], self.lengths)
+        return Near(events, bool(is_rough.any()), bool(is_undecided.any()), rows[others], gaps[others], self.lengths)
 
     def _gaps(self, data: mujoco.MjData) -> tuple[_Mask, _Rows, _PerRow, _PerRow, _Mask]:
         """Return of contacts and limits whether they are rough, J, gap, least width, and whether force jumps."""
@@ -178,6 +180,23 @@ class Surfaces:
             _LEAST_WIDTH * width,
             first_impedance > _NO_JUMP,
         )
+
+
+def widened(model: mujoco.MjModel, contact: float, limit: float) -> mujoco.MjModel:
+    """Return a copy whose contacts and limits act at gaps larger by so much (m; m or rad)."""
+    far = copy.deepcopy(model)
+    far.geom_margin[:] += contact / 2
+    far.flex_margin[:] += contact / 2
+    far.pair_margin[:] += contact
+    far.opt.o_margin += contact
+    far.jnt_margin[:] += limit
+    far.tendon_margin[:] += limit
+    return far
+
+
+def undecided(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """Return copies in which gaps of the size of rounding are closed, and open."""
+    return widened(model, 2 * _ROUNDING, 2 * _ROUNDING), widened(model, -2 * _ROUNDING, -2 * _ROUNDING)
 
 
 def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:

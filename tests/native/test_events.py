@@ -262,3 +262,25 @@ def test_a_soft_limit_at_its_surface_does_not_narrow_differences():
         engine="mujoco",
     )
     assert np.isfinite(mg.linearise(scene, mg.initial_state(scene), contact=mg.Slope()).A).all()
+
+
+def test_rounding_decides_no_derivative():
+    """A puck held on a tilted floor by its joints touches it at random; where it starts, it ends as much farther."""
+    scene = mg.load_scene("""<mujoco><worldbody><body euler="20 30 10"><geom type="plane" size="5 5 .1"/><body pos=".1 .2 .1">
+        <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><geom size=".1"/></body></body></worldbody></mujoco>""")
+    num_acting = [_num_contacts(scene, x) for x in np.linspace(0, 1, 50)]
+    assert 0 < sum(num_acting) < 50
+
+    def outcome(x):
+        start = mg.initial_state(scene, jnp.array([x, 0.0]), jnp.array([0.5, 0.2]))
+        return mg.rollout(scene, start, horizon=50, contact=mg.Slope("mujoco")).final.qpos
+
+    _, derivatives = jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,)))(jnp.linspace(0, 0.1, 8))
+    np.testing.assert_allclose(derivatives, np.tile([1.0, 0.0], (8, 1)), atol=1e-4)  # differences of 1e-6 of a few mm a step
+
+
+def _num_contacts(scene, x):
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[0] = x
+    mujoco.mj_forward(scene.mj_model, data)
+    return data.ncon
