@@ -20,7 +20,7 @@ from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, wind
 from mjxgrad.loop.run import Method
 
 Metrics = dict[str, Float[Array, ""]]
-_TRACE = 0.95  # λ of the value function's targets
+_CRITIC_TRACE = 0.95  # λ of the value function's targets
 _TARGET_RATE = 0.8  # share by which the target value function follows the value function
 _LARGEST_NORM = 1.0  # to which gradients are clipped
 
@@ -163,8 +163,9 @@ class ActorCritic(Method):
         def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
             arrays, policy, critic, stddev = shared
             own = eqx.combine(arrays, structure)
+            networks = (policy.actor, critic, policy.normaliser)
             return window_gradients(
-                own, state, model_key, noise, policy.actor, critic, policy.normaliser, stddev, self.settings.discount
+                own, state, model_key, noise, *networks, stddev, self.settings.discount, self.settings.trace
             )
 
         # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
@@ -212,7 +213,7 @@ class ActorCritic(Method):
 
         def targets(window: Window) -> Float[Array, " steps"]:
             return lambda_returns(
-                window, lambda obs: learner.target(normaliser(obs))[0], self.settings.discount, _TRACE
+                window, lambda obs: learner.target(normaliser(obs))[0], self.settings.discount, _CRITIC_TRACE
             )
 
         wanted = jax.vmap(targets)(window).reshape(-1)

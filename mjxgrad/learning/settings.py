@@ -13,6 +13,8 @@ class Settings:
         num_environments: number of environments side by side.
         window: steps of each environment per update.
         discount: discount per step.
+        trace: λ of the returns that the policy climbs, see `window`: 1 differentiates through the whole window, 0 through one
+            step and the value function after it.
         rule: map from the evidence of a step and action to the weight of its first-order gradient. It is asked for each of
             them. A failure probability of a twentieth would bring in much noise, so the default is smaller.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
@@ -33,6 +35,7 @@ class Settings:
     num_environments: int = 64
     window: int = 32
     discount: float = 0.99
+    trace: float = 1.0
     rule: Rule = dataclasses.field(default_factory=lambda: Consistent(failure_probability=1e-3))
     stddev: tuple[float, float] = (0.4, 0.1)
     actor_layers: tuple[int, ...] = (128, 64, 32)
@@ -50,8 +53,9 @@ class Settings:
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0 <= self.discount <= 1:
-            raise ValueError(f"discount must be from 0 to 1, got {self.discount}")
+        for name in ("discount", "trace"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
         if not self.largest_sample > 0:
             raise ValueError(f"largest_sample must be positive, got {self.largest_sample}")
         if min(self.stddev) <= 0:

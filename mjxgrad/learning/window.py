@@ -7,16 +7,25 @@ time was up, $V$ of its last observation is added first. There are two gradients
 - first order, $\lambda_t = dJ/du_t$ through physics, policy and value function, by one reverse pass;
 - zeroth order, $z_t = \gamma^t A_t\, w_t/\sigma$ with the advantage $A_t = \sum_{k \ge t} \gamma^{k-t} r_k + \ldots - V(o_t)$.
 
+**The blended adjoint.** A derivative through $H$ steps grows with every contact, and does not see that an episode may end.
+Both can be had from a value function: the policy climbs the TD($\lambda$) return of every step,
+$G_t = r_t + \gamma((1 - \lambda) V(o_{t+1}) + \lambda G_{t+1})$, in place of the sum of rewards. Its gradient takes one reverse
+pass, too. Going backward, the adjoint $p$ of the state between two steps is replaced by
+$\lambda p + (1 - \lambda) \gamma^t \nabla V$, so that derivatives reach $1/(1 - \gamma\lambda)$ steps. With $\lambda = 1$ it is that
+of $J$; with $\lambda = 0$ that of one step. In zeroth order $A_t$ is $G_t - V(o_t)$.
+
 The mean of the second is the gradient of $J$; so is the mean of the first where nothing jumps. One pull-back takes either to
 the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. The two can therefore be
 compared and mixed by step and action, and a derivative that is not finite is found where it arises.
 
 References:
-    Those of `learn`: Xu et al. for the window, Onoda et al. for the mixture by step.
+    Those of `learn`: Xu et al. for the window, Onoda et al. for the mixture by step. Hafner, Lillicrap, Ba, Norouzi. Dream to
+    Control. ICLR 2020, arXiv:1912.01603, for the objective of the blended adjoint.
 """
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -86,9 +95,13 @@ class Gradients(eqx.Module):
         return dataclasses.replace(self, first=scale[..., None] * self.first), is_long
 
 
-def returned(window: Window, value: Value, discount: float) -> Float[Array, ""]:
-    r"""Return the return $J$ of a window."""
-    after = jnp.where(window.done.at[-1].set(True), discount * window.next_values(value), 0)
+def returned(window: Window, value: Value, discount: float, trace: float = 1.0) -> Float[Array, ""]:
+    r"""Return the return $J$ of a window; with a trace below 1, that whose derivative is the blended one.
+
+    The values of states between two steps enter by $1 - \lambda$; `run_window` multiplies their adjoints by $\lambda$.
+    """
+    share = jnp.where(window.done.at[-1].set(True), 1.0, 1 - trace)
+    after = discount * share * window.next_values(value)
     return (weights_in_return(window, discount) * (window.rewards + after)).sum()
 
 
@@ -128,20 +141,32 @@ def run_window(
     actor: Network,
     normaliser: Normaliser,
     noise: Float[Array, "steps nu"],
+    trace: float = 1.0,
 ) -> tuple[Window, EnvState]:
     """Run a policy for one step per row of noise, which is added to actions before squashing.
 
-    The next window starts from the returned state.
+    The next window starts from the returned state. Adjoints of states between two steps are multiplied by the trace.
     """
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
         action = jnp.tanh(actor(normaliser(state.obs)) + added)
         stepped, following = environment.step_on(state, action)
         ends = (stepped.terminated, stepped.truncated)
+        if trace != 1:
+            following = _faded(following, trace)
         return following, Window(state.obs, stepped.obs, stepped.reward, *ends, stepped.metrics)
 
     final, window = jax.lax.scan(advance, state, noise)
     return window, final
+
+
+def _faded(state: EnvState, share: float) -> EnvState:
+    """Return the state unchanged, to the bit, with its derivative multiplied by a share."""
+
+    def fade(x: Any) -> Any:
+        return x + (share - 1) * (x - jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
+
+    return jax.tree.map(fade, state)
 
 
 def window_gradients(
@@ -154,6 +179,7 @@ def window_gradients(
     normaliser: Normaliser,
     stddev: Float[Array, ""],
     discount: float,
+    trace: float = 1.0,
 ) -> tuple[Window, EnvState, Gradients]:
     """Run a window in one environment and differentiate its return; under `jax.vmap`, in many.
 
@@ -166,11 +192,11 @@ def window_gradients(
         return critic(normaliser(obs))[0]
 
     def gain(change: Float[Array, "steps nu"]):
-        window, final = run_window(copy, state, actor, normaliser, stddev * noise + change)
-        return returned(window, value, discount), (window, final)
+        window, final = run_window(copy, state, actor, normaliser, stddev * noise + change, trace)
+        return returned(window, value, discount, trace), (window, final)
 
     first, (window, final) = jax.grad(gain, has_aux=True)(jnp.zeros_like(noise))
-    advantages = lambda_returns(window, value, discount, 1.0) - jax.vmap(value)(window.obs)
+    advantages = lambda_returns(window, value, discount, trace) - jax.vmap(value)(window.obs)
     zeroth = (weights_in_return(window, discount) * advantages)[:, None] * noise / stddev
     return window, final, Gradients(first, zeroth, jnp.isfinite(first).all(axis=1))
 

@@ -1,5 +1,6 @@
 """Windows: what they return, both of its gradients, and how these are mixed."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -7,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import solve_discrete_lyapunov
 
+import mjxgrad as mg
 from mjxgrad import envs
 from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
 from mjxgrad.learning import learner
@@ -85,8 +88,8 @@ def gradients_at(cartpole, networks):
     """From a start and noise to windows and gradients, for a batch."""
     actor, critic, normaliser = networks
 
-    @jax.jit
-    def run(states, noise):
+    @functools.partial(jax.jit, static_argnames="trace")
+    def run(states, noise, trace=1.0):
         keys = jax.random.split(jax.random.key(0), len(noise))
         one = functools.partial(
             window_gradients,
@@ -96,6 +99,7 @@ def gradients_at(cartpole, networks):
             normaliser=normaliser,
             stddev=jnp.asarray(STDDEV),
             discount=DISCOUNT,
+            trace=trace,
         )
         return jax.vmap(lambda state, key, noise: one(state, key, noise))(states, keys, noise)
 
@@ -119,6 +123,87 @@ def test_the_first_order_gradient_is_the_slope_of_the_return(cartpole, networks,
         change = jnp.zeros_like(noise).at[t].set(1e-5)
         slope = (value(STDDEV * noise + change) - value(STDDEV * noise - change)) / 2e-5
         assert_allclose(found.first[0, t, 0], slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("trace", [0.0, 0.6])
+def test_the_blended_gradient_is_the_slope_of_each_step_s_lambda_return(cartpole, networks, gradients_at, key, trace):
+    """By central differences as above, later actions following by the policy; the motion is the same to the bit."""
+    actor, critic, normaliser = networks
+    start = cartpole.reset(key)
+    noise = jnp.array([[0.4], [-1.2], [0.7]])
+    states = jax.tree.map(lambda x: x[None], start)
+    window, _, found = gradients_at(states, noise[None], trace=trace)
+    assert_array_equal(window.obs, gradients_at(states, noise[None])[0].obs)
+
+    @jax.jit
+    def targets(added):
+        window, _ = run_window(cartpole, start, actor, normaliser, added)
+        return lambda_returns(window, lambda obs: critic(normaliser(obs))[0], DISCOUNT, trace)
+
+    for t in range(STEPS):
+        change = jnp.zeros_like(noise).at[t].set(1e-5)
+        slope = (targets(STDDEV * noise + change) - targets(STDDEV * noise - change))[t] / 2e-5
+        assert_allclose(found.first[0, t, 0], DISCOUNT**t * slope, rtol=1e-6)
+
+
+class Spring(envs.Environment):
+    """A mass on a spring, whose reward is quadratic."""
+
+    scene: mg.Scene
+
+    def observe(self, state, memory):
+        return jnp.concatenate([state.qpos, state.qvel])
+
+    def rewards(self, before, action, after, memory):
+        return {"cost": -(after.qpos**2).sum() - (after.qvel**2).sum()}
+
+
+class Quadratic(Network):
+    """The function -xᵀPx."""
+
+    P: jax.Array
+
+    def __call__(self, inputs):
+        return -(inputs @ self.P @ inputs)[None]
+
+
+def test_with_the_exact_value_function_the_trace_changes_no_mean():
+    """Under a policy that is zero the motion is linear, and the value is -xᵀPx, P = Σ (γAᵀA)ᵏ by the Lyapunov equation.
+
+    With a value four times as large it does, and zeroth order has the changed mean, too.
+    """
+    scene = mg.load_scene("""<mujoco><option gravity="0 0 0" timestep=".1"/><worldbody><body><joint name="x" type="slide"
+        axis="1 0 0" stiffness="3" damping="1"/><geom size=".1" mass="1"/></body></worldbody>
+        <actuator><motor joint="x" gear="5" ctrlrange="-1 1"/></actuator></mujoco>""")
+    environment = Spring(scene)
+    A = np.asarray(mg.linearise(scene, mg.initial_state(scene), jnp.zeros(1)).A)
+    P = solve_discrete_lyapunov(np.sqrt(DISCOUNT) * A.T, A.T @ A)
+    noise = jax.random.normal(jax.random.key(1), (8192, STEPS, 1))
+
+    @functools.partial(jax.jit, static_argnames="trace")
+    def gradients(P, trace):
+        def one(noise):
+            state = environment.reset(jax.random.key(0))
+            state = dataclasses.replace(state, physics=mg.initial_state(scene, jnp.array([0.5]), jnp.array([1.0])))
+            state = dataclasses.replace(state, obs=environment.observe(state.physics, None))
+            networks = (Quadratic((), (), jnp.zeros((2, 2))), Quadratic((), (), P), Normaliser.make(2))
+            return window_gradients(
+                environment, state, jax.random.key(0), noise, *networks, jnp.asarray(STDDEV), DISCOUNT, trace
+            )[2]
+
+        found = jax.vmap(one)(jnp.concatenate([noise, -noise]))
+        return jax.tree.map(lambda x: x.reshape(2, len(noise), -1).mean(axis=0), found)  # of opposite noise
+
+    def off(difference):
+        return np.abs(difference.mean(axis=0)) / (difference.std(axis=0) / len(difference) ** 0.5 + 1e-12)
+
+    whole, half, none = (gradients(P, trace).first for trace in (1.0, 0.5, 0.0))
+    assert np.all(off(half - whole) < 4)
+    assert np.all(off(none - whole) < 4)
+    wrong = gradients(4 * P, 0.5)
+    assert np.all(off(wrong.first - gradients(4 * P, 1.0).first)[:-1] > 6)
+    assert np.all(off(wrong.zeroth - wrong.first) < 4)
+    assert off(wrong.zeroth - gradients(4 * P, 1.0).first)[0] > 6
 
 
 def test_pulled_back_it_is_the_derivative_by_the_parameters(cartpole, networks, gradients_at, key):
