@@ -11,8 +11,8 @@ time was up, $V$ of its last observation is added first. There are two gradients
 Both can be had from a value function: the policy climbs the TD($\lambda$) return of every step,
 $G_t = r_t + \gamma((1 - \lambda) V(o_{t+1}) + \lambda G_{t+1})$, in place of the sum of rewards. Its gradient takes one reverse
 pass, too. Going backward, the adjoint $p$ of the state between two steps is replaced by
-$\lambda p + (1 - \lambda) \gamma^t \nabla V$, so that derivatives reach $1/(1 - \gamma\lambda)$ steps. With $\lambda = 1$ it is that
-of $J$; with $\lambda = 0$ that of one step. In zeroth order $A_t$ is $G_t - V(o_t)$.
+$\lambda p + (1 - \lambda) \gamma^t \nabla V$, so that derivatives reach $1/(1 - \gamma\lambda)$ steps. With
+$\lambda = 1$ it is that of $J$; with $\lambda = 0$ that of one step. In zeroth order $A_t$ is $G_t - V(o_t)$.
 
 The mean of the second is the gradient of $J$; so is the mean of the first where nothing jumps. One pull-back takes either to
 the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. The two can therefore be

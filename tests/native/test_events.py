@@ -267,7 +267,8 @@ def test_a_soft_limit_at_its_surface_does_not_narrow_differences():
 def test_rounding_decides_no_derivative():
     """A puck held on a tilted floor by its joints touches it at random; where it starts, it ends as much farther."""
     scene = mg.load_scene("""<mujoco><worldbody><body euler="20 30 10"><geom type="plane" size="5 5 .1"/><body pos=".1 .2 .1">
-        <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><geom size=".1"/></body></body></worldbody></mujoco>""")
+        <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
+        </mujoco>""")
     num_acting = [_num_contacts(scene, x) for x in np.linspace(0, 1, 50)]
     assert 0 < sum(num_acting) < 50
 
