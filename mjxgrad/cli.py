@@ -236,7 +236,7 @@ def identify(
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
         motions.append(one)
-    fitted, judged = files.hold_out(loaded, motions, held_out)
+    fitted, judged = files.hold_out(motions, held_out)
     log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
     result = mg.identify(
         loaded,

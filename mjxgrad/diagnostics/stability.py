@@ -12,7 +12,7 @@ $1 / d_w$ times these, where a row gets the whole acceleration that it asks for.
 
 import math
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad._text import format_number, name_pairs
+from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
@@ -178,7 +178,8 @@ class StabilityReport:
         lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speed}"]
         if not self.springs:
             return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
-        lines += _aligned([_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()])
+        rows = [_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()]
+        lines += [f"  {line}" for line in aligned(rows)]
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)
         return "\n".join(
@@ -196,12 +197,11 @@ class StabilityReport:
             yield (f"{kind} {name_pairs(same)}", *cells)
 
     def _cells(self, spring: Spring) -> tuple[str, ...]:
-        low, high = (f"{x:.4g}" for x in spring.impedance)
         cells = (
             *map(format_number, (spring.stiffness, spring.damping, np.sqrt(max(spring.stiffness, 0.0)))),
             *map(format_number, (spring.damping_ratio, 1e3 * spring.time_constant)),
             format_number(1e3 * spring.given) if spring.is_hidden and spring.given is not None else "",
-            low if low == high else f"{low}–{high}",
+            format_range(spring.impedance),
             *map(format_number, (spring.load, spring.coupled_load, spring.num_steps)),
         )
         if self.speed is None:
@@ -291,12 +291,6 @@ def _short(spring: Spring) -> str | None:
         f"{STEPS_IN_CONTACT:g}; use a time step below {format_number(spring.timestep * spring.num_steps / STEPS_IN_CONTACT)} s, "
         "or a softer contact"
     )
-
-
-def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    rows = list(rows)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
 
 
 def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityReport:

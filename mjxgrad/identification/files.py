@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -25,8 +24,7 @@ from mjxgrad.identification.parameters import (
     mass,
     softness,
 )
-from mjxgrad.identification.recording import Recording
-from mjxgrad.rollouts import initial_state
+from mjxgrad.identification.recording import Recording, start_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
@@ -35,6 +33,12 @@ _SOFTNESS = ("stiffness", "damping_ratio", "width")
 _NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
 KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
+_WRITTEN = (
+    *((kind, field) for kind in ("geom", "pair") for field in ("friction", "solref", "solimp")),
+    *(("actuator", field) for field in ("gear", "gainprm", "biasprm")),
+    *(("dof", field) for field in ("damping", "armature", "frictionloss")),
+    *(("body", field) for field in ("mass", "ipos", "inertia", "iquat")),
+)
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
 
@@ -128,11 +132,10 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
             f"{path} must have columns of the scene's joints or sensors, got {', '.join(unknown) or 'none'}"
             + f"; did you mean {', '.join(near)}?" * bool(near)
         )
-    start = _first(scene, found)
     noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
     at = times - times[0]
-    made = Recording(found, controls, at, None if controls is None else at, noise, start, name=str(path))
-    return made, tuple(unknown)
+    made = Recording(found, controls, at, None if controls is None else at, noise, name=str(path))
+    return dataclasses.replace(made, start=start_of(scene, made, at)), tuple(unknown)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -200,16 +203,6 @@ def column_names(scene: Scene) -> dict[tuple[str, int], str]:
     return {(signal, index): name for name, [(_, signal, index, _), *_] in places}
 
 
-def _first(scene: Scene, found: Mapping[str, np.ndarray]) -> Any:
-    """Return the state of the first row; missing parts are the scene's pose, at rest."""
-    given = {}
-    for key in ("qpos", "qvel", "act"):
-        if key in found:
-            row, default = found[key][0], np.asarray(getattr(scene.data, key))
-            given[key] = jnp.asarray(np.where(np.isfinite(row), row, default))
-    return initial_state(scene, **given)
-
-
 def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
     """Return the variation of each column; for positions, one number per velocity."""
     if name == "qpos":
@@ -222,11 +215,10 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
     return np.maximum(size, _SMALLEST_SIZE * size.max(initial=0.0)) if size.any() else np.ones_like(size)
 
 
-def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
     """Split recordings into those to fit and those held out: every n-th of several, or the end of a single one.
 
     Args:
-        scene: the scene of the recordings.
         recordings: all recordings.
         share: held-out share, below 1; 0 holds out nothing.
 
@@ -262,39 +254,25 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     """
     spec = mujoco.MjSpec.from_file(str(source))
     spec.compile()  # assigns element ids
-    before, after = numbers_of(scene.model), numbers_of(found.model)
-    changed = {n: np.asarray(v, float) for n, v in after.items() if not np.array_equal(v, before[n])}
-
-    def rows(*fields: str) -> list[int]:
-        parts = [
-            np.asarray(before[f] != changed[f]).reshape(len(changed[f]), -1).any(axis=1) for f in fields if f in changed
-        ]
-        return np.flatnonzero(np.any(parts, axis=0)).tolist() if parts else []
-
-    inertial = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
-    bodies = rows(*inertial)
-    parts = {
-        "geom": (("friction", "solref", "solimp"), spec.geoms, "geom_"),
-        "pair": (("friction", "solref", "solimp"), spec.pairs, "pair_"),
-        "actuator": (("gear", "gainprm", "biasprm"), spec.actuators, "actuator_"),
-    }
-    for fields, elements, prefix in parts.values():
-        for field in fields:
-            for row in rows(prefix + field):
-                target = next(one for one in elements if one.id == row)
-                value = changed[prefix + field][row]
-                setattr(target, field, value[: len(np.ravel(getattr(target, field)))])
-    for body in (one for one in spec.bodies if one.id in bodies):
-        values = [np.asarray(after[name], float)[body.id] for name in inertial]
-        body.explicitinertial = True
-        body.mass, body.ipos, body.inertia, body.iquat = float(values[0]), *values[1:]
-        body.fullinertia[:] = np.nan
-    for field in ("damping", "armature", "frictionloss"):
-        for dof in rows(f"dof_{field}"):
-            joint = next(one for one in spec.joints if one.id == scene.mj_model.dof_jntid[dof])
-            value = float(changed[f"dof_{field}"][dof])
-            present = getattr(joint, field)
-            setattr(joint, field, value if np.ndim(present) == 0 else np.array([value, *np.ravel(present)[1:]]))
+    elements = dict(geom=spec.geoms, pair=spec.pairs, actuator=spec.actuators, dof=spec.joints, body=spec.bodies)
+    before, after = numbers_of(scene.model), {k: np.asarray(v, float) for k, v in numbers_of(found.model).items()}
+    for kind, field in _WRITTEN:
+        values = after[f"{kind}_{field}"]
+        differs = (np.asarray(before[f"{kind}_{field}"]) != values).reshape(len(values), -1).any(axis=1)
+        for row in np.flatnonzero(differs).tolist():
+            index = scene.mj_model.dof_jntid[row] if kind == "dof" else row
+            element = next(one for one in elements[kind] if one.id == index)
+            if kind == "body":
+                element.explicitinertial, element.mass = True, float(after["body_mass"][row])
+                element.ipos, element.inertia, element.iquat = (
+                    after[f"body_{name}"][row] for name in ("ipos", "inertia", "iquat")
+                )
+                element.fullinertia[:] = np.nan
+                continue
+            present = np.array(getattr(element, field), float)
+            count = min(values[row].size, present.size)
+            present.ravel()[:count] = values[row].ravel()[:count]
+            setattr(element, field, present if present.ndim else float(present))
     for folder in ("meshdir", "texturedir"):
         there = Path(source).parent / (getattr(spec, folder) or "")
         setattr(spec, folder, os.path.relpath(there, Path(path).parent))

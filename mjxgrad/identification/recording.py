@@ -32,8 +32,7 @@ class Recording:
         control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
             (m, rad). The default is 1. Ratios weigh the signals; the overall size is estimated.
-        start: the state at time 0; None for the first row of "qpos" and "qvel" if it is at time 0, else the scene's pose, at
-            rest.
+        start: the state at time 0; None for what was measured then, else the scene's pose, at rest.
         name: name in messages.
     """
 
@@ -183,7 +182,7 @@ def _window(
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
     return Windows(
-        state=_start(scene, recording, times),
+        state=start_of(scene, recording, times),
         controls=jnp.asarray(_controls(scene, recording, num_steps, timestep)),
         index=jnp.asarray(np.pad(index, spare)),
         share=jnp.asarray(np.pad(place - index, spare)),
@@ -205,12 +204,14 @@ def _width(scene: Scene, name: str) -> int:
     return jax.eval_shape(lambda: sensor(scene.model, scene.data, name)).shape[0]
 
 
-def _start(scene: Scene, recording: Recording, times: np.ndarray) -> State:
+def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
+    """Return the state at time 0: the given one, else the first row; missing parts are the scene's pose, at rest."""
     if recording.start is not None:
         return recording.start
-    first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured}
-    known = {name: row for name, row in first.items() if times[0] == 0 and np.isfinite(row).all()}
-    return initial_state(scene, **known)
+    first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured and times[0] == 0}
+    return initial_state(
+        scene, **{name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
+    )
 
 
 def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:

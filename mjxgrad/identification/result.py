@@ -21,7 +21,7 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from mjxgrad._text import format_number
+from mjxgrad._text import aligned, format_number
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
@@ -138,7 +138,7 @@ class Identification:
                 f"{head}, {self.stopped.value}.",
                 f"{rms}.",
                 "",
-                *self._table(),
+                *aligned(self.rows()),
                 *[f"\n{line}" for line in self.warnings()],
             ]
         )
@@ -156,11 +156,6 @@ class Identification:
                 (f"{name} ({unit})" if unit else name, *shown, f"{format_number(low)} to {format_number(high)}")
             )
         return rows
-
-    def _table(self) -> list[str]:
-        rows = self.rows()
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
     def warnings(self) -> list[str]:
         """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
-from mjxgrad._text import format_number, name_pairs
+from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
@@ -321,7 +321,7 @@ def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
     yield "k", "1/s²", _numbers(parameters.stiffness)
     yield "b", "1/s", _numbers(parameters.damping)
     yield "ζ", "", _numbers(parameters.damping_ratio)
-    yield "impedance", "", [_range(row) for row in np.asarray(parameters.impedance)]
+    yield "impedance", "", [format_range(row) for row in np.asarray(parameters.impedance)]
     yield "width", "mm", _numbers(1e3 * parameters.width)
     yield "h²k+2hb", "", _numbers(parameters.stability)
     frictions = np.asarray(parameters.friction).tolist()
@@ -340,26 +340,14 @@ def _friction(condim: int, friction: Sequence[float]) -> str:
     return " ".join(cells) or "none"
 
 
-def _range(pair: np.ndarray) -> str:
-    low, high = (f"{x:.4g}" for x in pair)
-    return low if low == high else f"{low}–{high}"
-
-
 def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = False) -> str:
     """Return a title and aligned columns, the first left-aligned; nothing without rows."""
     if not rows:
         return ""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    align = str.rjust if is_numeric else str.ljust
-    lines = []
-    for first, *others in rows:
-        cells = [align(cell, width) for cell, width in zip(others, widths[1:], strict=True)]
-        line = "  " + "  ".join([first.ljust(widths[0]), *cells]).rstrip()
-        if not is_numeric and len(line) > _WIDTH:
-            # Only sentences wrap: a broken row of numbers is unreadable.
-            line = textwrap.fill(line.strip(), _WIDTH, initial_indent="  ", subsequent_indent="      ")
-        lines.append(line)
-    return "\n".join([title, *lines])
+    # Only sentences wrap: a broken row of numbers is unreadable.
+    width, align = (10**6, str.rjust) if is_numeric else (_WIDTH, str.ljust)
+    indents = {"initial_indent": "  ", "subsequent_indent": "      "}
+    return "\n".join([title, *(textwrap.fill(line, width, **indents) for line in aligned(rows, align))])
 
 
 def _bullets(title: str, sentences: Sequence[str]) -> str:
