@@ -37,6 +37,7 @@ from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, sample
 from mjxgrad.objective import Objective, ParameterNoise
 from mjxgrad.objective.base import unchanged
+from mjxgrad.report import require
 from mjxgrad.scene import SceneWarning
 
 # The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
@@ -245,10 +246,9 @@ class BiasVariance(eqx.Module):
 
     def plot(self) -> Any:
         """Draw bias and variance against softness by matplotlib, one column per point, and return the figure."""
-        try:
-            import matplotlib.pyplot as plt
-        except ImportError as error:
-            raise ImportError("a picture needs matplotlib: pip install 'mjxgrad[render]'") from error
+        require()
+        import matplotlib.pyplot as plt
+
         table, (title, swept), points = self.table(), self.knob, len(self.params)
         settings = {"squeeze": False, "sharex": True, "sharey": "row", "layout": "constrained"}
         figure, axes = plt.subplots(2, points, figsize=(max(4.6, 3.2 * points), 5.4), **settings)
@@ -310,7 +310,7 @@ def bias_variance(
     """
     if jnp.ndim(params) != 2:
         raise ValueError(
-            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
+            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter params[:, None]"
         )
     params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
@@ -490,7 +490,5 @@ def _stacked(softness: PyTree) -> tuple[PyTree, int]:
     softness = jax.tree.map(jnp.asarray, softness)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
     if len(lengths) != 1 or () in lengths or (0,) in lengths:
-        raise ValueError(
-            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; see Softness.sweep"
-        )
+        raise ValueError(f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}")
     return softness, lengths.pop()[0]

@@ -3,35 +3,27 @@
 import csv
 import dataclasses
 import difflib
+import functools
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjxgrad.identification import parameters
 from mjxgrad.identification.inertia import inertia
-from mjxgrad.identification.parameters import (
-    Parameter,
-    armature,
-    damping,
-    friction,
-    friction_loss,
-    gains,
-    gear,
-    mass,
-    softness,
-)
+from mjxgrad.identification.parameters import Parameter
 from mjxgrad.identification.recording import Recording, start_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
 _Object = mujoco.mjtObj
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
-_NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
-KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
+_NAMED = ("mass", "damping", "armature", "friction_loss", "gear")
+KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
 _WRITTEN = (
     *((kind, field) for kind in ("geom", "pair") for field in ("friction", "solref", "solimp")),
@@ -73,14 +65,15 @@ def parameter(scene: Scene, text: str) -> Parameter:
         subset: dict[str, Any] = {"pairs": pairs} if pairs else {"geoms": names} if names else {}
         if bounds is not None:
             subset["bounds"] = bounds
-        return friction(scene, **subset) if kind == "friction" else softness(scene, kind, **subset)
+        make = parameters.friction if kind == "friction" else functools.partial(parameters.softness, part=kind)
+        return make(scene, **subset)
     if not names:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
     if kind in _NAMED:
-        return _NAMED[kind](scene, *names, bounds=bounds)
+        return getattr(parameters, kind)(scene, *names, bounds=bounds)
     if len(names) > 1 or (bounds is not None and kind == "inertia"):
         raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
-    return inertia(scene, *names) if kind == "inertia" else gains(scene, *names, bounds=bounds)
+    return inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
@@ -103,9 +96,7 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     columns = _read(Path(path))
     times = columns.pop("time", None)
     if times is None or len(times) < 2 or not (np.diff(times) > 0).all():
-        raise ValueError(
-            f"{path} must have a column named time, which increases (s), got {', '.join(columns) or 'nothing'}"
-        )
+        raise ValueError(f"{path} must have a column named time, increasing (s), got {', '.join(columns) or 'nothing'}")
     places, unknown = _places(scene.mj_model), []
     widths = {key: getattr(scene.data, key).shape[0] for key in ("qpos", "qvel", "act", "ctrl")}
     found: dict[str, np.ndarray] = {}
@@ -157,9 +148,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         except ValueError as error:
             raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
     if len({len(column) for column in found.values()}) > 1:
-        raise ValueError(
-            f"all of {path} must have the same number of rows, got { ({n: len(c) for n, c in found.items()}) }"
-        )
+        raise ValueError(f"columns of {path} must be as long as time, got { ({n: len(c) for n, c in found.items()}) }")
     return found
 
 
@@ -254,11 +243,12 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     """
     spec = mujoco.MjSpec.from_file(str(source))
     spec.compile()  # assigns element ids
-    elements = dict(geom=spec.geoms, pair=spec.pairs, actuator=spec.actuators, dof=spec.joints, body=spec.bodies)
+    elements = {"geom": spec.geoms, "pair": spec.pairs, "actuator": spec.actuators, "dof": spec.joints}
+    elements["body"] = spec.bodies
     before, after = numbers_of(scene.model), {k: np.asarray(v, float) for k, v in numbers_of(found.model).items()}
     for kind, field in _WRITTEN:
         values = after[f"{kind}_{field}"]
-        differs = (np.asarray(before[f"{kind}_{field}"]) != values).reshape(len(values), -1).any(axis=1)
+        differs = (np.asarray(before[f"{kind}_{field}"]) != values).any(axis=tuple(range(1, values.ndim)))
         for row in np.flatnonzero(differs).tolist():
             index = scene.mj_model.dof_jntid[row] if kind == "dof" else row
             element = next(one for one in elements[kind] if one.id == index)

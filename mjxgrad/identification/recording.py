@@ -49,9 +49,7 @@ class Recording:
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
         if len(lengths) != 1:
-            raise ValueError(
-                f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}"
-            )
+            raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {lengths}")
         count = len(self.controls) if self.controls is not None else None
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
             raise ValueError(
@@ -61,16 +59,12 @@ class Recording:
         for name in ("times", "control_times"):
             value = getattr(self, name)
             if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
-                raise ValueError(
-                    f"{name} of {self.name} must increase from 0 or later, got {np.asarray(value).tolist()}"
-                )
+                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
         for name, value in self.noise.items():
             if not (np.asarray(value) > 0).all():
-                raise ValueError(
-                    f"noise of {name} of {self.name} must be positive, got {np.asarray(value).tolist()}; inf weighs nothing"
-                )
+                raise ValueError(f"noise of {name} of {self.name} must be positive, or inf for no weight, got {value}")
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
         """Return windows of a duration, each from a measured state; a shorter remainder is dropped.
@@ -220,7 +214,7 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
     controls = np.asarray(recording.controls, float)
     if controls.ndim != 2 or controls.shape[1] != scene.model.nu:
         raise ValueError(
-            f"controls of {recording.name} must have {scene.model.nu} columns in this scene, got shape {controls.shape}"
+            f"controls of {recording.name} must have {scene.model.nu} columns in this scene, got {controls.shape}"
         )
     if recording.control_times is not None:
         at = timestep * np.arange(num_steps)

@@ -54,7 +54,6 @@ def linearise(
         inputs = {name: getattr(scene.data, name)[None] for name in INPUTS[1:] if getattr(scene.data, name).size}
         found = by_mujoco(scene, start, inputs | {"ctrl": ctrl[None]}, native.gradient)
         return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
-    scene.check_mjx()
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
     end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
 

@@ -112,7 +112,7 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
         name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
         if is_within:
             raise ValueError(
-                f"qpos must have a quaternion that is not zero, got zeros for {name}; no turn is 1, 0, 0, 0"
+                f"qpos must have a quaternion that is not zero, got zeros for {name}; 1, 0, 0, 0 is no turn"
             )
         unit = units[int(kind)]
         yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"

@@ -179,7 +179,7 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
         model.names.decode()
     except UnicodeDecodeError as error:
         raise SceneError(
-            f"{name} must have names in UTF-8, got {model.names[error.start :][:1]!r}; save it as UTF-8"
+            f"{name} must have names in UTF-8, got {error.object[error.start :][:1]!r}; save it so"
         ) from None
     if model.nv == 0:
         reason = "so that nothing can move; give a body a joint"

@@ -70,15 +70,6 @@ class Scene(eqx.Module):
         """The default engine: "mjx", or "mujoco" where MJX lacks something."""
         return "mujoco" if self.unsupported else "mjx"
 
-    def check_mjx(self) -> None:
-        """Refuse a scene that MJX cannot step.
-
-        Raises:
-            SceneError: with the features that MJX lacks.
-        """
-        if self.unsupported:
-            raise SceneError(self.unsupported)
-
     def contact_parameters(self) -> ContactParameters:
         """Return the effective parameters of the pairs that can touch, one row each; traceable."""
         return contact_parameters(self.model, self.pairs)
@@ -123,15 +114,12 @@ class Scene(eqx.Module):
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
-        for name, value in changed.items():
-            if is_known(value) and np.isnan(value).any():
+        for name, least in ((name, np.min(value, initial=np.inf)) for name, value in changed.items() if is_known(value)):
+            if np.isnan(least):
                 raise ValueError(f"{name} must hold numbers, got NaN")
-            if is_known(value) and (
-                (name in _NOT_NEGATIVE and (np.asarray(value) < 0).any())
-                or (name == "timestep" and not np.asarray(value).all())
-            ):
+            if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
-                raise ValueError(f"{name} must {requirement}, got {np.asarray(value).min():g}")
+                raise ValueError(f"{name} must {requirement}, got {least:g}")
         if "wind" in fields and not has_medium(self.mj_model):
             _warn(self, "wind acts on nothing without a medium: set density or viscosity in <option>")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
@@ -346,8 +334,8 @@ def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = Fa
         return ""
     # Only sentences wrap: a broken row of numbers is unreadable.
     width, align = (10**6, str.rjust) if is_numeric else (_WIDTH, str.ljust)
-    indents = {"initial_indent": "  ", "subsequent_indent": "      "}
-    return "\n".join([title, *(textwrap.fill(line, width, **indents) for line in aligned(rows, align))])
+    wrap = textwrap.TextWrapper(width, initial_indent="  ", subsequent_indent="      ").fill
+    return "\n".join([title, *map(wrap, aligned(rows, align))])
 
 
 def _bullets(title: str, sentences: Sequence[str]) -> str:
