@@ -1,6 +1,6 @@
 """Numbers and names as text, for messages and tables."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def aligned(rows: Sequence[Sequence[str]], align: Callable[[str, int], str] = st
     return ["  ".join([row[0].ljust(widths[0]), *map(align, row[1:], widths[1:])]).rstrip() for row in rows]
 
 
-def format_range(pair: Sequence[float]) -> str:
+def format_range(pair: Iterable[float]) -> str:
     """Return two numbers as a range, or as one if they are equal."""
     low, high = (f"{x:.4g}" for x in pair)
     return low if low == high else f"{low}–{high}"

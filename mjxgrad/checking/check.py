@@ -152,9 +152,8 @@ def check(
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
         with contextlib.suppress(TimeoutError):
-            measured = measure(
-                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
-            )
+            given = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
+            measured = measure(scene, motions, mover, rng, **given)
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
     advice = findings.recommend(scene, motions, stability, measured, max_contacts)

@@ -81,9 +81,7 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     bad = [pose for pose, step in zip(motions.poses, motions.bad_steps, strict=True) if step >= 0]
     if bad:
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
-        text = (
-            f"From {bad[0]} the motion ceases to be finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
-        )
+        text = f"From {bad[0]} the motion is not finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
         yield Finding("not_finite", text, True)
     yield from _contact_findings(scene, motions)
     if motions.idle:
@@ -178,9 +176,8 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         stiffness = felt[0].stiffness
         lead = "One" if stiffness is None else f"With all contacts at {format_number(stiffness)} 1/s² one"
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
-        times = [
-            "over a million" if x > 1e6 else format_number(float(f"{x:.1g}")) for x in (one.advantage for one in felt)
-        ]
+        ratios = [one.advantage for one in felt]
+        times = ["over a million" if x > 1e6 else format_number(float(f"{x:.1g}")) for x in ratios]
         values = " and ".join(dict.fromkeys(times))
         text = f"{lead} first-order sample is worth {values} of zeroth order, under noise of {noises}. {ends}."
         yield Finding("order", text)

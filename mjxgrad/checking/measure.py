@@ -186,9 +186,8 @@ def _direction(
     model, timestep = scene.model, float(scene.model.opt.timestep)
     units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, num_steps * timestep)
     sizes = _TEETH * timestep * speed, _SPEED_SHARE * speed, _CONTROL_SHARE * half_range(scene)
-    parts = [
-        size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in zip(sizes, units, strict=True)
-    ]
+    both = zip(sizes, units, strict=True)
+    parts = [size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in both]
     wide = _WIDE if number == _NUM_LINES - 1 else 1.0
     has_start, has_controls = number != 1 or not model.nu, number != 0 and model.nu > 0
     # Positions stay narrow: wide ones would begin in penetration.

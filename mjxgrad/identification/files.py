@@ -98,7 +98,6 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     if times is None or len(times) < 2 or not (np.diff(times) > 0).all():
         raise ValueError(f"{path} must have a column named time, increasing (s), got {', '.join(columns) or 'nothing'}")
     places, unknown = _places(scene.mj_model), []
-    widths = {key: getattr(scene.data, key).shape[0] for key in ("qpos", "qvel", "act", "ctrl")}
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
         place = places.get(name, ())
@@ -109,13 +108,11 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
         if not place:
             unknown.append(name)
             continue
-        key, signal, index, width = place[0]
-        whole = found.setdefault(signal, np.full((len(times), widths.get(key, width)), np.nan))
-        whole[:, index] = column
-    controls = found.pop("ctrl", None)
-    if scene.model.nu and (controls is None or not np.isfinite(controls).all()):
-        bad = range(scene.model.nu) if controls is None else np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist()
-        names = ", ".join(_name(scene.mj_model, _Object.mjOBJ_ACTUATOR, i) or f"[{i}]" for i in bad)
+        _, signal, index, width = place[0]
+        found.setdefault(signal, np.full((len(times), width), np.nan))[:, index] = column
+    controls = found.pop("ctrl", np.full((len(times), scene.model.nu), np.nan))
+    if bad := np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist():
+        names = ", ".join(mujoco.mj_id2name(scene.mj_model, _Object.mjOBJ_ACTUATOR, i) or f"[{i}]" for i in bad)
         raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; it lacks {names}")
     if not found:
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
@@ -125,7 +122,8 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
         )
     noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
     at = times - times[0]
-    made = Recording(found, controls, at, None if controls is None else at, noise, name=str(path))
+    driven = {"controls": controls, "control_times": at} if scene.model.nu else {}
+    made = Recording(found, times=at, noise=noise, name=str(path), **driven)
     return dataclasses.replace(made, start=start_of(scene, made, at)), tuple(unknown)
 
 
@@ -134,11 +132,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             wholes = {name: np.asarray(arrays[name], float) for name in arrays}
-        wholes = {
-            name: value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value for name, value in wholes.items()
-        }
-        found = {name: value for name, value in wholes.items() if value.ndim == 1}
-        found |= {f"{n}[{i}]": v[:, i] for n, v in wholes.items() if v.ndim == 2 for i in range(v.shape[1])}
+        wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
+        found = {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
     else:
         with path.open(encoding="utf-8-sig", newline="") as file:
             names, *rows = [row for row in csv.reader(file) if row] or [[]]
@@ -152,26 +147,22 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str | None:
-    return mujoco.mj_id2name(model, kind, index)
-
-
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
     """Return for each possible column name its kind, signal, index in the signal, and the signal's width."""
     whole: dict[str, list] = {}
     own: list[tuple[str, str | None, str, Sequence[int], int]] = []
     ends = [*model.jnt_qposadr[1:], model.nq]
     for joint in range(model.njnt):
-        name = _name(model, _Object.mjOBJ_JOINT, joint)
+        name = mujoco.mj_id2name(model, _Object.mjOBJ_JOINT, joint)
         own.append(("qpos", name, "qpos", range(model.jnt_qposadr[joint], ends[joint]), model.nq))
         own.append(("qvel", name, "qvel", np.flatnonzero(model.dof_jntid == joint).tolist(), model.nv))
     for actuator in range(model.nu):
-        name = _name(model, _Object.mjOBJ_ACTUATOR, actuator)
+        name = mujoco.mj_id2name(model, _Object.mjOBJ_ACTUATOR, actuator)
         own.append(("ctrl", name, "ctrl", [actuator], model.nu))
         first, count = model.actuator_actadr[actuator], model.actuator_actnum[actuator]
         own.append(("act", name, "act", range(first, first + count) if first >= 0 else [], model.na))
     for index in range(model.nsensor):
-        name, width = _name(model, _Object.mjOBJ_SENSOR, index), int(model.sensor_dim[index])
+        name, width = mujoco.mj_id2name(model, _Object.mjOBJ_SENSOR, index), int(model.sensor_dim[index])
         own.append(("sensor", name, name or "", range(width), width))
     for kind, name, signal, indices, width in own:
         for i, index in enumerate(indices):
@@ -227,9 +218,8 @@ def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Record
     early = {name: value[~is_late] for name, value in whole.measured.items()}
     # The end starts where the recording does: positions and speeds in the middle may be unmeasured.
     late = {name: np.where(is_late[:, None], value, np.nan) for name, value in whole.measured.items()}
-    return [dataclasses.replace(whole, measured=early, times=times[~is_late])], [
-        dataclasses.replace(whole, measured=late)
-    ]
+    fitted = dataclasses.replace(whole, measured=early, times=times[~is_late])
+    return [fitted], [dataclasses.replace(whole, measured=late)]
 
 
 def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) -> None:
@@ -254,9 +244,8 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
             element = next(one for one in elements[kind] if one.id == index)
             if kind == "body":
                 element.explicitinertial, element.mass = True, float(after["body_mass"][row])
-                element.ipos, element.inertia, element.iquat = (
-                    after[f"body_{name}"][row] for name in ("ipos", "inertia", "iquat")
-                )
+                place = [after[f"body_{name}"][row] for name in ("ipos", "inertia", "iquat")]
+                element.ipos, element.inertia, element.iquat = place
                 element.fullinertia[:] = np.nan
                 continue
             present = np.array(getattr(element, field), float)

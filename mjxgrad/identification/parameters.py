@@ -87,9 +87,8 @@ class Coordinates(eqx.Module):
             for name, p in parameters.items()
             for place in np.ndindex(p.nominal.shape)
         ]
-        return cls(
-            nominal, lower, upper, tuple(names), tuple((name, p.nominal.shape) for name, p in parameters.items())
-        )
+        shapes = tuple((name, p.nominal.shape) for name, p in parameters.items())
+        return cls(nominal, lower, upper, tuple(names), shapes)
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""

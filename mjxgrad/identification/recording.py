@@ -169,10 +169,8 @@ def _window(
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
         if name == "qpos":  # an incomplete quaternion is useless
-            value, is_there = (
-                np.where(is_there, value, np.asarray(scene.data.qpos)),
-                _joints_there(scene.model, is_there),
-            )
+            value = np.where(is_there, value, np.asarray(scene.data.qpos))
+            is_there = _joints_there(scene.model, is_there)
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
     return Windows(
@@ -203,9 +201,8 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
     if recording.start is not None:
         return recording.start
     first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured and times[0] == 0}
-    return initial_state(
-        scene, **{name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
-    )
+    whole = {name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
+    return initial_state(scene, **whole)
 
 
 def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:
@@ -276,5 +273,5 @@ def residuals(
             change = jax.vmap(position_change, (None, 0, 0))(scene.model, measured, change)
         else:
             change -= measured
-        parts.append((change * window.weight[name]).ravel())
-    return jnp.concatenate(parts), diverged
+        parts.append(change * window.weight[name])
+    return jnp.concatenate(parts, axis=1).ravel(), diverged

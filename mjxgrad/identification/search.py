@@ -343,9 +343,8 @@ def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
     along = axes.T @ (columns.T @ residual)
     is_clear = sizes > jnp.sqrt(jnp.finfo(sizes.dtype).eps) * jnp.max(sizes)
     total = jnp.sum(residual**2)
-    return jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0)) / jnp.where(
-        total > 0, total, 1.0
-    )
+    removed = jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0))
+    return removed / jnp.where(total > 0, total, 1.0)
 
 
 def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, size: float) -> tuple[Array, Array, Array]:
@@ -364,14 +363,9 @@ def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, siz
 
 def _correlation(windows: Windows, residual: np.ndarray) -> float:
     """Return the correlation of residuals with those of the same signal one time before, from -1 to 1."""
-    products = squares = 0.0
-    shapes = [weight.shape for weight in windows.weight.values()]
-    ends = np.cumsum([math.prod(shape[1:]) for shape in shapes])
-    for shape, part in zip(shapes, np.split(residual, ends[:-1], axis=1), strict=True):
-        signal = part.reshape(shape)
-        products += float((signal[:, 1:] * signal[:, :-1]).sum())
-        squares += float((signal**2).sum())
-    return products / squares if squares else 0.0
+    signals = residual.reshape(*windows.index.shape, -1)
+    squares = float((signals**2).sum())
+    return float((signals[:, 1:] * signals[:, :-1]).sum()) / squares if squares else 0.0
 
 
 def _without_offsets(

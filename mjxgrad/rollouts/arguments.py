@@ -78,6 +78,12 @@ def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
     return None
 
 
+def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return a state, and the scene's resting inputs beside controls, as `native` takes them."""
+    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
+    return start, {name: getattr(scene.data, name) for name in INPUTS[1:] if getattr(scene.data, name).size}
+
+
 def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:
     """Refuse controls of a policy unless there is one per actuator: other shapes would silently be added or broadcast."""
     chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen

@@ -14,7 +14,7 @@ import numpy as np
 from mjxgrad._mjx import mjx
 from mjxgrad._text import name_pairs
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
-from mjxgrad.scene.refusals import element_name, has_constraints, has_friction_loss, has_limits, has_medium
+from mjxgrad.scene.refusals import ACTUATORS, element_name, has_constraints, has_friction_loss, has_limits, has_medium
 
 _DISABLE = mujoco.mjtDisableBit
 _ENABLE = mujoco.mjtEnableBit
@@ -154,14 +154,9 @@ def kinematics_alone(model: mujoco.MjModel) -> mujoco.MjModel:
     bare.opt.cone, bare.opt.enableflags, bare.opt.noslip_iterations = mujoco.mjtCone.mjCONE_PYRAMIDAL, 0, 0
     bare.geom_contype[:] = bare.geom_conaffinity[:] = 0
     bare.geom_type[np.concatenate([bare.pair_geom1, bare.pair_geom2])] = _SPHERE
-    for of, enumeration, used in (
-        ("actuator_trntype", mjx.TrnType, mujoco.mjtTrn.mjTRN_JOINT),
-        ("actuator_dyntype", mjx.DynType, mujoco.mjtDyn.mjDYN_NONE),
-        ("actuator_gaintype", mjx.GainType, mujoco.mjtGain.mjGAIN_FIXED),
-        ("actuator_biastype", mjx.BiasType, mujoco.mjtBias.mjBIAS_NONE),
-    ):
-        kinds = getattr(bare, of)
-        kinds[~np.isin(kinds, [int(kind) for kind in enumeration])] = used
+    for _, field, known, *_ in ACTUATORS:
+        kinds = getattr(bare, field)
+        kinds[~np.isin(kinds, [int(kind) for kind in known])] = 0  # at a joint, no dynamics, a fixed gain, no bias
     bare.eq_type[~np.isin(bare.eq_type, [int(kind) for kind in mjx.EqType])] = mujoco.mjtEq.mjEQ_CONNECT
     list(drop_sensors(bare))
     return bare

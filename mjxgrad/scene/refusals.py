@@ -41,13 +41,13 @@ def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray
     return find
 
 
-def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: type, prefix: str):
+def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: type):
     """Return a function that names elements whose type MJX does not know, with this type."""
 
     def find(model: mujoco.MjModel) -> list[str]:
         known = {int(member) for member in ours}
         return [
-            f"{element_name(model, kind, i)} ({theirs(t).name.removeprefix(prefix).lower()})"
+            f"{element_name(model, kind, i)} ({theirs(t).name.partition('_')[2].lower()})"
             for i, t in enumerate(getattr(model, field))
             if int(t) not in known
         ]
@@ -155,6 +155,13 @@ def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
 _DIRECTLY = "remove it from the MJCF"
 _LINEAR = "keep the linear coefficient only"
 
+# The part of an actuator, its field, the kinds that MJX knows, all kinds, and the remedy.
+ACTUATORS = (
+    ("transmission", "actuator_trntype", mjx.TrnType, mujoco.mjtTrn, "drive a joint, tendon or site instead"),
+    ("dynamics", "actuator_dyntype", mjx.DynType, mujoco.mjtDyn, "use none, integrator, filter, filterexact or muscle"),
+    ("gain", "actuator_gaintype", mjx.GainType, mujoco.mjtGain, "use fixed, affine or muscle"),
+    ("bias", "actuator_biastype", mjx.BiasType, mujoco.mjtBias, "use none, affine or muscle"),
+)
 # The missing feature; a function that names its uses in a model; the remedy.
 REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...] = (
     ("flexible bodies", _where(_OBJECT.mjOBJ_FLEX, lambda m: np.ones(m.nflex, bool)),
@@ -199,18 +206,8 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
      _when(lambda m: has_medium(m) and m.opt.integrator == _INTEGRATOR.mjINT_IMPLICITFAST,
            lambda m: f"density={m.opt.density:g}, viscosity={m.opt.viscosity:g}"),
      "use 'Euler' or 'RK4'"),
-    ("such actuator transmission",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_trntype", mjx.TrnType, mujoco.mjtTrn, "mjTRN_"),
-     "drive a joint, tendon or site instead"),
-    ("such actuator dynamics",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_dyntype", mjx.DynType, mujoco.mjtDyn, "mjDYN_"),
-     "use none, integrator, filter, filterexact or muscle"),
-    ("such actuator gain",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_gaintype", mjx.GainType, mujoco.mjtGain, "mjGAIN_"),
-     "use fixed, affine or muscle"),
-    ("such actuator bias",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_biastype", mjx.BiasType, mujoco.mjtBias, "mjBIAS_"),
-     "use none, affine or muscle"),
+    *((f"such actuator {word}", _unknown_type(_OBJECT.mjOBJ_ACTUATOR, field, ours, theirs), remedy)
+      for word, field, ours, theirs, remedy in ACTUATORS),
     ("actuators with several controls", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_ctrlnum != 1),
      "use one actuator per control"),
     ("disabled actuator groups", _where(_OBJECT.mjOBJ_ACTUATOR, _disabled_actuators),
@@ -220,8 +217,7 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
     ("actuator delay", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_history[:, 0] > 0),
      "remove delay and nsample, and delay the controls before the rollout"),
     ("such equality constraint",
-     _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq, "mjEQ_"),
-     "use connect, weld, joint or tendon"),
+     _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq), "use connect, weld, joint or tendon"),
     ("flags that disable only springs or only dampers",
      _when(lambda m: bool(m.opt.disableflags & _DISABLE.mjDSBL_SPRING) != bool(m.opt.disableflags & _DISABLE.mjDSBL_DAMPER),
            "one of <flag spring='disable'/> and <flag damper='disable'/>"),

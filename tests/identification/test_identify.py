@@ -167,9 +167,9 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     windows = stack(scene, whole.cut(0.08, 0.01))
     assert windows.controls.shape == (3, 8, 1)
     evaluate = jax.jit(jax.vmap(lambda w: residuals(scene, w, None, None, contact=mg.Discrete())[0]))
-    found = np.array(evaluate(windows))[:, : 9 * 7].reshape(3, 9, 7)
+    found = np.array(evaluate(windows)).reshape(3, 9, 14)[..., :7]
     assert np.abs(found).max() < 1e-7
-    whole_found = np.array(evaluate(stack(scene, [whole]))[0][: 31 * 7]).reshape(31, 7)
+    whole_found = np.array(evaluate(stack(scene, [whole]))[0]).reshape(31, 14)[:, :7]
     np.testing.assert_allclose(whole_found[25], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
 
 
