@@ -297,9 +297,8 @@ def _library() -> Any:
     try:
         all_devices()
     except (AssertionError, RuntimeError) as error:  # JAX asserts where JAX_PLATFORMS names a missing platform
-        raise CommandError(
-            f"JAX finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: unset it {error}".rstrip()
-        ) from error
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise CommandError(f"JAX finds no device of JAX_PLATFORMS={asked}: unset it {error}".rstrip()) from error
     library = importlib.import_module("mjxgrad")
     library.keep_compiled()
     return library

@@ -130,10 +130,8 @@ def compare_to_slope(
     y, epsilon = y.astype(float), np.finfo(y.dtype if np.issubdtype(y.dtype, np.floating) else float).eps
     slopes = np.array([np.asarray(one, float) for one in derivatives])
     if slopes.shape != (len(gradients), *y.shape) or x.shape != y.shape[:1]:
-        raise ValueError(
-            "derivatives must hold one array of the outcomes' shape, whose first axis is that of the parameters, for "
-            f"each of {len(gradients)} gradients, got {slopes.shape} beside {y.shape} and {x.shape}"
-        )
+        expected = f"of the shape of outcomes, for each of {len(gradients)} gradients and {len(x)} parameters"
+        raise ValueError(f"derivatives must hold one array {expected}, got {slopes.shape} beside {y.shape}")
     if len(x) < _FEWEST_PHASES or not (np.diff(x) > 0).all():
         raise ValueError(f"parameters must be at least {_FEWEST_PHASES} and increase, got {len(x)}")
     width = (x[-1] - x[0]) * len(x) / (len(x) - 1)

@@ -47,9 +47,7 @@ def parameter(scene: Scene, text: str) -> Parameter:
     """
     match = re.fullmatch(r"(\w+)(?::([^=]+))?(?:=([^=]+?)\.\.([^=]+))?", text)
     if match is None or match[1] not in KINDS:
-        raise ValueError(
-            f"a parameter must be kind:name or kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}"
-        )
+        raise ValueError(f"a parameter must be kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}")
     kind, names = match[1], tuple((match[2] or "").split(",")) if match[2] else ()
     try:
         bounds = None if match[3] is None else (float(match[3]), float(match[4]))
@@ -102,9 +100,8 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     for name, column in columns.items():
         place = places.get(name, ())
         if len(place) > 1:
-            raise ValueError(
-                f"{name} of {path} must say what it is, as one of {', '.join(sorted(f'{k}:{name}' for k, *_ in place))}"
-            )
+            kinds = ", ".join(sorted(f"{kind}:{name}" for kind, *_ in place))
+            raise ValueError(f"{name} of {path} must say what it is, as one of {kinds}")
         if not place:
             unknown.append(name)
             continue
@@ -116,10 +113,8 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
         raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; it lacks {names}")
     if not found:
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
-        raise ValueError(
-            f"{path} must have columns of the scene's joints or sensors, got {', '.join(unknown) or 'none'}"
-            + f"; did you mean {', '.join(near)}?" * bool(near)
-        )
+        given = (", ".join(unknown) or "none") + f"; did you mean {', '.join(near)}?" * bool(near)
+        raise ValueError(f"{path} must have columns of the scene's joints or sensors, got {given}")
     noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
     at = times - times[0]
     driven = {"controls": controls, "control_times": at} if scene.model.nu else {}

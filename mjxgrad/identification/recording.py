@@ -52,9 +52,9 @@ class Recording:
             raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {lengths}")
         count = len(self.controls) if self.controls is not None else None
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
+            needed = f"{count + 1} rows for {count} controls, one at each state"
             raise ValueError(
-                f"measured of {self.name} must have {count + 1} rows for {count} controls, one at each state, the first and "
-                f"last included, got {max(lengths)}: add what is missing, as NaN if need be, or give times"
+                f"measured of {self.name} must have {needed}, or times, got {max(lengths)}: NaN fills gaps"
             )
         for name in ("times", "control_times"):
             value = getattr(self, name)
@@ -143,9 +143,9 @@ def _num_steps(recording: Recording, timestep: float) -> int:
     """Return the number of steps up to the last measurement; refuse more than there are controls."""
     needed = max(1, int(np.ceil(_times(recording, timestep)[-1] / timestep - 1e-6)))
     if recording.controls is not None and recording.control_times is None and needed > len(recording.controls):
+        given = len(recording.controls)
         raise ValueError(
-            f"controls of {recording.name} must have a row for each of {needed} steps up to the last measurement, "
-            f"got {len(recording.controls)}"
+            f"controls of {recording.name} must have a row for each of {needed} measured steps, got {given}"
         )
     return needed
 
