@@ -114,10 +114,9 @@ class Scene(eqx.Module):
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
-        known = {
-            name: np.asarray(value) for name, value in changed.items() if is_known(value)
-        }  # not jnp, traced in jit
-        for name, least in ((name, value.min(initial=np.inf)) for name, value in known.items()):
+        # Not jnp, which jit would trace.
+        known = {name: np.asarray(value).min(initial=np.inf) for name, value in changed.items() if is_known(value)}
+        for name, least in known.items():
             if np.isnan(least):
                 raise ValueError(f"{name} must hold numbers, got NaN")
             if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
