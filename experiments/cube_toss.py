@@ -16,13 +16,13 @@ from pydantic import Field
 import mjxgrad as mg
 from experiments.config import ExperimentError
 from experiments.motion import advance, at_time_step
+from experiments.problems.integration import adaptive_rollout
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import capitalised, joined, percent, quantity
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
-from mjxgrad.rollouts.integration import adaptive_rollout
 from mjxgrad.rollouts.state import data_of
 from mjxgrad.tasks import scene_path
 

@@ -173,7 +173,7 @@ def _along(model: mujoco.MjModel, scene: mg.Scene, places: np.ndarray, *, measur
 
 def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
-    names = "slope mean standard_error resolution num_teeth irregularity spread num_finite"
+    names = "slope mean standard_error resolution num_teeth spread num_finite"
     shown: dict[str, Any] = {"steps": "off"}
     begin = time.perf_counter()
     for count in _PHASES:  # each takes four times as long as the one before

@@ -36,9 +36,7 @@ def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> 
 def whole(name: str, value: Any, least: int | None = 1) -> int:
     """Return a count; refuse fractions, counts that are too small, and traced values."""
     if isinstance(value, jax.core.Tracer):
-        raise ValueError(
-            f"{name} must be known before anything is compiled, got a traced value; make it static in jax.jit"
-        )
+        raise ValueError(f"{name} must be known before anything is compiled, got a traced value; make it static")
     try:
         number = operator.index(value)
     except TypeError:

@@ -1,6 +1,6 @@
 """Numbers and names as text, for messages and tables."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -10,6 +10,18 @@ def name_pairs(pairs: Sequence[object]) -> str:
     if len(pairs) == 1 or (len(pairs) == 2 and sum(len(str(pair)) for pair in pairs) < 36):
         return ", ".join(str(pair) for pair in pairs)
     return f"{pairs[0]} + {len(pairs) - 1} more"
+
+
+def aligned(rows: Sequence[Sequence[str]], align: Callable[[str, int], str] = str.rjust) -> list[str]:
+    """Return rows of cells as lines of columns, the first one left-aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join([row[0].ljust(widths[0]), *map(align, row[1:], widths[1:])]).rstrip() for row in rows]
+
+
+def format_range(pair: Iterable[float]) -> str:
+    """Return two numbers as a range, or as one if they are equal."""
+    low, high = (f"{x:.4g}" for x in pair)
+    return low if low == high else f"{low}–{high}"
 
 
 def format_number(x: float) -> str:

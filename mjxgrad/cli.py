@@ -6,7 +6,6 @@ import importlib.util
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -82,25 +81,19 @@ def main(arguments: list[str] | None = None) -> int:
     # SIGTERM is handled like Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        status = app(arguments, exit_on_error=False, print_error=False) or 0
+        return app(arguments, exit_on_error=False, print_error=False) or 0
     except KeyboardInterrupt:
         _say("interrupted")
-        status = 130
+        return 130
     except BrokenPipeError:  # the reader has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except cyclopts.CycloptsError as error:
         _say(f"{str(error).rstrip('.')}; mjxgrad --help lists the commands")
-        status = 2
     # The library refuses by these errors, in a sentence; any other error is a bug.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
-        status = 2
-    if arguments is None and threading.active_count() > 1:
-        # An abandoned compilation of `check` cannot be stopped otherwise, and the exit would wait for it.
-        sys.stdout.flush()
-        os._exit(status)
-    return status
+    return 2
 
 
 def _say(text: str) -> None:
@@ -223,9 +216,7 @@ def identify(
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
     mg, log = _library(), _timed()
-    files, page = (
-        importlib.import_module(f"mjxgrad.{name}") for name in ("identification.files", "identification.page")
-    )
+    files, page = (importlib.import_module(f"mjxgrad.identification.{name}") for name in ("files", "page"))
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     loaded = mg.load_scene(_existing(scene), keep_everything=True)
@@ -236,7 +227,7 @@ def identify(
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
         motions.append(one)
-    fitted, judged = files.hold_out(loaded, motions, held_out)
+    fitted, judged = files.hold_out(motions, held_out)
     log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
     result = mg.identify(
         loaded,
@@ -306,9 +297,8 @@ def _library() -> Any:
     try:
         all_devices()
     except (AssertionError, RuntimeError) as error:  # JAX asserts where JAX_PLATFORMS names a missing platform
-        raise CommandError(
-            f"JAX finds no device of JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: unset it {error}".rstrip()
-        ) from error
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise CommandError(f"JAX finds no device of JAX_PLATFORMS={asked}: unset it {error}".rstrip()) from error
     library = importlib.import_module("mjxgrad")
     library.keep_compiled()
     return library
@@ -324,11 +314,8 @@ def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = 
     """Refuse in advance an output file that cannot be written, or a page without the packages for pages."""
     if path is None:
         return
-    there = (
-        next(folder for folder in path.absolute().parents if folder.exists())
-        if makes_folder
-        else path.absolute().parent
-    )
+    folders = path.absolute().parents
+    there = next(folder for folder in folders if folder.exists()) if makes_folder else folders[0]
     if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be an existing folder that can be written to")
     if is_page:

@@ -22,7 +22,7 @@ from experiments.words import percent
 from experiments.workspace import Workspace
 from mjxgrad.checking.moving import compiler_options
 from mjxgrad.checking.sweep import Knob
-from mjxgrad.diagnostics import BiasVariance, bias_variance, mean_interval
+from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
 
@@ -157,17 +157,16 @@ def _ramp(settings: Settings) -> _Problem:
 def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settings: Settings) -> xr.Dataset:
     first, zeroth, cell = measured.first, measured.zeroth, ("stiffness", "angle")
     intervals = {
-        "first_order": (first.value, measured.first_interval),
-        "zeroth_order": (zeroth.value, measured.zeroth_interval),
-        "reference": (measured.reference, measured.reference_interval),
-        "bias": (measured.bias, measured.bias_interval),
-        "first_order_variance": (first.covariance_diagonal, measured.first_variance_interval[..., None]),
-        "zeroth_order_variance": (zeroth.covariance_diagonal, measured.zeroth_variance_interval[..., None]),
+        "first_order": (first.value, measured.interval("first")),
+        "zeroth_order": (zeroth.value, measured.interval("zeroth")),
+        "reference": (measured.reference, measured.interval("reference")),
+        "bias": (measured.bias, measured.interval("bias")),
+        "first_order_variance": (first.covariance_diagonal, measured.variance_intervals["first"][..., None]),
+        "zeroth_order_variance": (zeroth.covariance_diagonal, measured.variance_intervals["zeroth"][..., None]),
     }
     if (mixed := measured.alpha_order) is not None:
-        ends = mean_interval(mixed.value, mixed.standard_error, mixed.num_finite[..., None], settings.confidence)
-        intervals["alpha_order"] = (mixed.value, ends)
-        ends = np.asarray(measured.alpha_order_variance_interval)[..., None]
+        intervals["alpha_order"] = (mixed.value, measured.interval("alpha_order"))
+        ends = measured.variance_intervals["alpha_order"][..., None]
         intervals["alpha_order_variance"] = (mixed.covariance_diagonal, ends)
     table = xr.Dataset(coords={"stiffness": stiffness, "angle": list(settings.angles)})
     has_default = settings.problem != "ramp" and settings.include_default

@@ -15,18 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
+from mjxgrad.checking import findings
 from mjxgrad.checking.figure import telling
-from mjxgrad.checking.findings import (
-    WORDS,
-    Finding,
-    Recommendation,
-    headline,
-    left_out_findings,
-    measured_findings,
-    recommend,
-    static_findings,
-    touch_speed,
-)
+from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.checking.moving import Mover, Outcomes
@@ -151,8 +142,8 @@ def check(
         started = time.perf_counter()
         motions = random_motions(scene, rng)
         scene, max_contacts = _with_room(scene, motions)
-        stability = check_stability(scene, speed=touch_speed(motions))
-    found = [*static_findings(scene, motions, stability), *_warned(caught)]
+        stability = check_stability(scene, speed=findings.touch_speed(motions))
+    found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = _outcomes(scene, cost, rng)
@@ -161,15 +152,14 @@ def check(
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
         with contextlib.suppress(TimeoutError):
-            measured = measure(
-                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
-            )
-        found += measured_findings(measured) if measured and measured.lines else ()
-        found += left_out_findings(measured if measured and measured.lines else None, budget)
-    advice = recommend(scene, motions, stability, measured, max_contacts)
+            given = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
+            measured = measure(scene, motions, mover, rng, **given)
+        found += findings.measured_findings(measured) if measured and measured.lines else ()
+        found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
+    advice = findings.recommend(scene, motions, stability, measured, max_contacts)
     return Verdict(
         name=scene.name,
-        headline=headline(found, advice, motions),
+        headline=findings.headline(found, advice, motions),
         findings=tuple(sorted(found, key=lambda one: (not one.is_fault, one.kind not in ("not_measured", "left_out")))),
         recommendation=advice,
         code=_code(scene, advice, path),
@@ -263,7 +253,7 @@ import mjxgrad as mg
 
 scene = mg.load_scene({path!r}{settings})
 cost = lambda trajectory: trajectory.qpos[-1, 0]  # yours
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {WORDS[advice.gradient]})
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {findings.WORDS[advice.gradient]})
 objective = {objective}
 estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
 """

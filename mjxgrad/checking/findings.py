@@ -81,9 +81,7 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     bad = [pose for pose, step in zip(motions.poses, motions.bad_steps, strict=True) if step >= 0]
     if bad:
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
-        text = (
-            f"From {bad[0]} the motion ceases to be finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
-        )
+        text = f"From {bad[0]} the motion is not finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
         yield Finding("not_finite", text, True)
     yield from _contact_findings(scene, motions)
     if motions.idle:
@@ -178,13 +176,11 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         stiffness = felt[0].stiffness
         lead = "One" if stiffness is None else f"With all contacts at {format_number(stiffness)} 1/s² one"
         noises = " and ".join(f"{one.stddev:g}" for one in felt)
-        values = " and ".join(dict.fromkeys(_times(one.advantage) for one in felt))
+        ratios = [one.advantage for one in felt]
+        times = ["over a million" if x > 1e6 else format_number(float(f"{x:.1g}")) for x in ratios]
+        values = " and ".join(dict.fromkeys(times))
         text = f"{lead} first-order sample is worth {values} of zeroth order, under noise of {noises}. {ends}."
         yield Finding("order", text)
-
-
-def _times(advantage: float) -> str:
-    return "over a million" if advantage > 1e6 else format_number(float(f"{advantage:.1g}"))
 
 
 def slopes(measured: Measured) -> tuple[Slope, ...]:
@@ -233,12 +229,7 @@ def recommend(
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
     softer = [noise for noise in measured.noises if noise.stiffness is not None and noise.stddev == stddev]
     limits = [noise.crossover for noise in own]
-    limits += [
-        float(t)
-        for line in measured.lines
-        for t, g in zip(measured.times, line.growth, strict=True)
-        if g > LARGEST_GROWTH
-    ]
+    limits += [t for line in measured.lines for t in measured.times[line.growth > LARGEST_GROWTH].tolist()]
     limit = min(limits, default=math.inf)
     is_limited = limit < measured.times[-1]
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mjxgrad._text import format_number
 from mjxgrad.checking.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.checking.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, contact_of, moved
+from mjxgrad.checking.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, moved
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
@@ -86,11 +86,8 @@ class Noise:
         """The ratio of samples that zeroth and first order need at the last time, as the median over outcomes."""
         first, zeroth = (one[:, -1].var(axis=0) for one in (self.first, self.zeroth))
         is_felt = zeroth > _UNFELT**2 * np.nanmax(zeroth, initial=0.0)
-        return (
-            float(np.median(zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])))
-            if is_felt.any()
-            else np.nan
-        )
+        ratios = zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])
+        return float(np.median(ratios)) if ratios.size else np.nan
 
 
 @dataclass(frozen=True)
@@ -129,24 +126,17 @@ def measure(
     directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
     softer = [SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))] if scene.pairs else []
     settings = [(stddev, soft) for soft in [None, *softer] for stddev in STDDEVS]
-    lines = [
+    asked: list[tuple[str, int, Callable[[], Line | Noise]]] = [
         (f"a line along {one[0]}", _LINE_BATCHES, functools.partial(probe.line, *at, *one))
         for at, one in zip(chosen, directions, strict=True)
     ]
-    noises = [
-        (
-            f"noise of {stddev:g}"
-            + ("" if stiffness is None else f" with contacts at {format_number(stiffness)} 1/s²"),
-            _NOISE_BATCHES,
-            functools.partial(
-                probe.noise, *chosen[0], stddev, stiffness, np.random.default_rng(int(rng.integers(2**31)))
-            ),
-        )
-        for stddev, stiffness in settings
-    ]
-
-    # In order of importance, since the last are left out where time is short.
-    asked = [lines[0], noises[0], *lines[1:], *noises[1:]]
+    for stddev, stiffness in settings:
+        words = "" if stiffness is None else f" with contacts at {format_number(stiffness)} 1/s²"
+        own_rng = np.random.default_rng(int(rng.integers(2**31)))
+        task = functools.partial(probe.noise, *chosen[0], stddev, stiffness, own_rng)
+        asked.append((f"noise of {stddev:g}{words}", _NOISE_BATCHES, task))
+    # In order of importance, since the last are left out where time is short: a line, noise, then the others.
+    asked.insert(1, asked.pop(_NUM_LINES))
     found, left_out, end = [], [], mover.end
     # One after the other: two at once deadlocked on dm_control's humanoid (two cores, jax 0.10.2).
     for words, num_batches, task in asked:
@@ -196,9 +186,8 @@ def _direction(
     model, timestep = scene.model, float(scene.model.opt.timestep)
     units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, num_steps * timestep)
     sizes = _TEETH * timestep * speed, _SPEED_SHARE * speed, _CONTROL_SHARE * half_range(scene)
-    parts = [
-        size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in zip(sizes, units, strict=True)
-    ]
+    both = zip(sizes, units, strict=True)
+    parts = [size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in both]
     wide = _WIDE if number == _NUM_LINES - 1 else 1.0
     has_start, has_controls = number != 1 or not model.nu, number != 0 and model.nu > 0
     # Positions stay narrow: wide ones would begin in penetration.
@@ -275,9 +264,8 @@ class _Probe:
         size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)
         has_controls = self.scene.model.nu > 0
         still = np.zeros(state.qvel.size)
-        wiggle = rng.normal(size=(1, still.size))
-        if has_controls:
-            wiggle = smooth(rng, steps, len(half), steps * self.motions.timestep)
+        seconds = steps * self.motions.timestep
+        wiggle = smooth(rng, steps, len(half), seconds) if has_controls else rng.normal(size=(1, still.size))
         along = wiggle / np.sqrt((wiggle**2).sum())
         noise = stddev * rng.normal(size=(size, *along.shape))
         states = _repeated(state, size)
@@ -286,10 +274,8 @@ class _Probe:
         else:
             direction, noisy = Direction(still, along[0], controls), np.repeat(controls[None], size, axis=0)
             states.qvel[:] += noise[:, 0]
-        contact = None
-        if stiffness is not None:
-            contact = contact_of(Softness(stiffness=stiffness, damping_ratio=1.0).apply(self.scene.model))
-        found = self.mover.move("slope", states, noisy, direction, self.lengths, contact)
+        softness = None if stiffness is None else Softness(stiffness=stiffness, damping_ratio=1.0)
+        found = self.mover.move("slope", states, noisy, direction, self.lengths, softness)
         # An outcome depends only on the noise of earlier steps.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
@@ -321,11 +307,7 @@ def _crossover(times: np.ndarray, first: np.ndarray, zeroth: np.ndarray) -> floa
 def crossing(
     times: Float[np.ndarray, " times"], first: Float[np.ndarray, " times"], second: Float[np.ndarray, " times"]
 ) -> float:
-    """Return the time from which the second of two mean squared errors is at most the first.
-
-    It follows the last time at which the first is smaller, so brief draws before it do not count. The logarithm of their
-    ratio is interpolated. It is infinite without a crossing, and the first time if the second is smaller throughout.
-    """
+    """Return the time from which the second of two mean squared errors is at most the first for good; infinite for none."""
     tiny = np.finfo(float).tiny  # two errors of zero are equal
     log_ratio = np.log(np.maximum(first, tiny)) - np.log(np.maximum(second, tiny))
     if not (log_ratio < 0).any():

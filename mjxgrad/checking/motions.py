@@ -5,17 +5,22 @@ They come first because they take a second and locate the expensive measurements
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
+from mjxgrad.contact import Softness
 from mjxgrad.contact.parameters import geom_name
+from mjxgrad.native.engine import engine_of
 from mjxgrad.rollouts import State
-from mjxgrad.rollouts.state import pose_warnings
+from mjxgrad.rollouts.state import VELOCITY_LIMIT, pose_warnings
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
+from mjxgrad.scene.scene import numbers_of
+from mjxgrad.stepping import Gradient
 
 _NUM_MOTIONS = 4
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 2.0, 1000, 50
@@ -23,9 +28,8 @@ _KNOTS_PER_SECOND = 4.0  # slow enough for bodies to follow
 _REACH = 0.8  # share of half the range, so that small changes are not clipped
 _REPLAYED = 100  # steps before and after the first touch, within which effects show
 _SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding in double precision over these steps
-_FASTEST = 1e4  # m/s, rad/s: a faster rollout counts as diverged
 _CLEARANCE = 0.01  # m, beyond the margin: a nearer pair may touch in similar motions
-_Start = tuple[str, np.ndarray, np.ndarray, np.ndarray]
+_States = dict[str, Any]  # qpos, qvel and act, with leading axes
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,6 @@ def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: 
 def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
     """Simulate a scene from its key frames and reference pose, under smooth random controls."""
     model, timestep = scene.to_mujoco(), float(scene.model.opt.timestep)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     num_steps = int(np.clip(round(_SECONDS / timestep), _FEWEST_STEPS, _MOST_STEPS))
     low, high = np.asarray(scene.ctrlrange, float).T
     middle, half = np.where(np.isfinite(low + high), (low + high) / 2, 0.0), half_range(scene)
@@ -104,24 +107,22 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
     chosen = [starts[i % len(starts)] for i in range(_NUM_MOTIONS)]
     wiggles = [smooth(rng, num_steps, model.nu, num_steps * timestep) for _ in chosen]
     controls = np.array([middle + _REACH * half * one for one in wiggles])
-    moved = [_roll(model, start[1:], ctrl) for start, ctrl in zip(chosen, controls, strict=True)]
-    qpos, qvel, act = (np.array([one[i] for one in moved]) for i in range(3))
-    touches, touching, onsets = _touches(model, qpos, qvel)
+    names, *parts = zip(*chosen, strict=True)
+    start: _States = dict(zip(("qpos", "qvel", "act"), map(np.array, parts), strict=True))
+    path, bad_steps = held(run(scene, start, controls))
+    touches, touching, onsets = _touches(model, path["qpos"], path["qvel"])
     begin = max(0, int(onsets[0]) - _REPLAYED)
-    start = (qpos[0, begin], qvel[0, begin], act[0, begin])
     window = controls[0, begin : begin + 2 * _REPLAYED]
     return Motions(
-        poses=tuple(name for name, *_ in chosen),
-        qpos=qpos,
-        qvel=qvel,
-        act=act,
+        **path,
+        poses=names,
         controls=controls,
         timestep=timestep,
-        bad_steps=np.array([one[3] for one in moved]),
+        bad_steps=bad_steps,
         onsets=onsets,
         touches=touches,
         touching=touching,
-        idle=_idle(model, start, window, half),
+        idle=_idle(scene, {name: x[:1, begin] for name, x in path.items()}, window, half),
     )
 
 
@@ -130,8 +131,8 @@ def first_keyframe(model: mujoco.MjModel) -> str | int | None:
     return (model.key(0).name or 0) if model.nkey else None
 
 
-def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[_Start]:
-    """Return the key frames, and the reference pose if it is valid or the only one."""
+def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield name and state of the key frames, and of the reference pose if it is valid or the only one."""
     for i in range(min(model.nkey, _NUM_MOTIONS - 1)):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or str(i)
         yield f"key frame {name}", model.key_qpos[i], model.key_qvel[i], model.key_act[i]
@@ -139,19 +140,35 @@ def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[_Start]:
         yield "the reference pose", model.qpos0, np.zeros(model.nv), np.zeros(model.na)
 
 
-def _roll(model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.ndarray) -> tuple:
-    """Return positions, velocities and activations, held from the first bad step on, and the bad steps."""
-    data, first_bad = mujoco.MjData(model), -1
-    data.qpos[:], data.qvel[:], data.act[:] = start
-    states = [tuple(np.array(part) for part in start)]
-    for step, ctrl in enumerate(controls):
-        if first_bad < 0:
-            data.ctrl[:] = ctrl
-            mujoco.mj_step(model, data)
-            is_good = np.isfinite(data.qpos).all() and (np.abs(data.qvel) < _FASTEST).all()
-            first_bad = -1 if is_good else step
-        states.append(states[-1] if first_bad >= 0 else (data.qpos.copy(), data.qvel.copy(), data.act.copy()))
-    return *(np.array(part) for part in zip(*states, strict=True)), first_bad
+def run(
+    scene: Scene,
+    start: _States,
+    controls: Float[np.ndarray, "motions steps nu"],
+    *,
+    softness: Softness | None = None,
+    refined: int = 1,
+    follow: tuple[Gradient, tuple[np.ndarray, np.ndarray]] | None = None,
+) -> _States:
+    """Return the states of motions by C MuJoCo at all steps and after the last, at a time step divided by `refined`.
+
+    With `follow`, a kind of derivative and changes of start and controls, "change" is what becomes of these after each step.
+    """
+    model = scene.model if softness is None else softness.apply(scene.model)
+    numbers = {name: np.asarray(value)[None] for name, value in numbers_of(model).items()}
+    numbers["opt.timestep"] = numbers["opt.timestep"] / refined
+    given = numbers, {"time": np.zeros((len(controls), 1)), **start}, {"ctrl": np.repeat(controls, refined, axis=1)}
+    engine = engine_of(scene.mj_model)
+    found = engine.run(*given) if follow is None else engine.follow(follow[0], *given, follow[1])
+    return found | {name: np.concatenate([start[name][:, None], found[name]], axis=1) for name in start}
+
+
+def held(path: _States) -> tuple[_States, Int[np.ndarray, " motions"]]:
+    """Return motions, held from their first bad step on, and these steps."""
+    is_good: Any = np.isfinite(path["qpos"]).all(axis=2) & (np.abs(path["qvel"]) < VELOCITY_LIMIT).all(axis=2)
+    first_bad = np.where(is_good[:, 1:].all(axis=1), -1, is_good[:, 1:].argmin(axis=1))
+    steps = np.arange(is_good.shape[1])
+    kept = np.where(first_bad[:, None] < 0, steps, np.minimum(steps, first_bad[:, None]))
+    return {name: np.take_along_axis(x, kept[..., None], axis=1) for name, x in path.items()}, first_bad
 
 
 def _touches(
@@ -202,21 +219,17 @@ def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:
 
 def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"], refined: int = 1) -> frozenset[str]:
     """Return the pairs that touch at any time of a motion by C MuJoCo, at a time step divided by `refined`."""
-    model = scene.to_mujoco()
-    model.opt.timestep /= refined
-    controls = np.repeat(controls, refined, axis=0)
-    qpos, qvel, _, _ = _roll(model, tuple(np.asarray(x, float) for x in (state.qpos, state.qvel, state.act)), controls)
-    touches, touching, _ = _touches(model, qpos[None], qvel[None])
+    start = {name: np.asarray(getattr(state, name), float)[None] for name in ("qpos", "qvel", "act")}
+    path, _ = held(run(scene, start, controls[None], refined=refined))
+    touches, touching, _ = _touches(scene.to_mujoco(), path["qpos"], path["qvel"])
     return frozenset([touch.pair for touch in touches]) | frozenset(touching)
 
 
-def _idle(
-    model: mujoco.MjModel, start: tuple[np.ndarray, ...], controls: np.ndarray, half: np.ndarray
-) -> tuple[str, ...]:
+def _idle(scene: Scene, start: _States, controls: Float[np.ndarray, "steps nu"], half: np.ndarray) -> tuple[str, ...]:
     """Return the names of the actuators whose control changes nothing in a motion."""
-    usual, found = _roll(model, start, controls), []
-    for i, size in enumerate(half):
-        other = _roll(model, start, controls + np.where(np.arange(model.nu) == i, (1 - _REACH) * size, 0.0))
-        if max(np.abs(other[k] - usual[k]).max(initial=0.0) for k in range(2)) < _SMALLEST_EFFECT:
-            found.append(element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i))
-    return tuple(found)
+    changes = (1 - _REACH) * np.diag(np.append(0.0, half))[:, None, 1:]  # none at first
+    starts = {name: np.repeat(x, len(changes), axis=0) for name, x in start.items()}
+    path, _ = held(run(scene, starts, controls + changes))
+    effects = [np.abs(path[name][1:] - path[name][:1]).max(axis=(1, 2)) for name in ("qpos", "qvel")]
+    idle = np.flatnonzero(np.maximum(*effects) < _SMALLEST_EFFECT).tolist()
+    return tuple(element_name(scene.mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in idle)

@@ -1,23 +1,23 @@
 """Batches of motions with their derivatives along one direction, by C MuJoCo, which compiles nothing."""
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from mjxgrad._mjx import mjx
 from mjxgrad.batched import device
+from mjxgrad.checking.motions import held, run
+from mjxgrad.contact import Softness
 from mjxgrad.native.derivative import to_coordinates
-from mjxgrad.native.engine import engine_of
 from mjxgrad.objective.task import finite_cost
 from mjxgrad.rollouts import State, Trajectory
 from mjxgrad.scene import Scene
@@ -29,7 +29,6 @@ REFINED = 4
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 # XLA's optimisation level 1 halves the time to compile (hopper, jax 0.10.2: 12 s in place of 24); the code is as fast.
 _OPTIONS = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-_VELOCITY_LIMIT = 1e4
 
 Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
 
@@ -88,7 +87,6 @@ class Mover:
     end: float = math.inf
 
     def __post_init__(self):
-        self.contact = contact_of(self.scene.model)
         self._judges: dict[tuple[int, ...], Callable] = {}
         self._num_steps, self._seconds = 0, 0.0
 
@@ -104,7 +102,7 @@ class Mover:
         controls: Float[np.ndarray, "motions steps nu"],
         direction: Direction,
         lengths: Sequence[int],
-        contact: dict[str, Array] | None = None,
+        softness: Softness | None = None,
     ) -> Moved:
         """Simulate a batch with its tangent along a direction, and return the outcomes after the given steps.
 
@@ -118,70 +116,45 @@ class Mover:
         controls = np.asarray(controls, float)[:, :steps]
         pushes = np.broadcast_to(direction.controls[:steps], controls.shape)
         change = np.concatenate([direction.positions, direction.velocities, np.zeros(start["act"].shape[1])])
-        contact = self.contact if contact is None else contact
+        follow = None if kind == "fine" else (kind, (np.tile(change, (num, 1)), pushes))
+        refined = REFINED if kind == "fine" else 1
         started = time.perf_counter()
-        path, course = self._run(kind, start, controls, (np.tile(change, (num, 1)), pushes), contact)
+        found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)
         self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
-        bad = ~np.all(np.abs(np.nan_to_num(path[1], nan=np.inf)) < _VELOCITY_LIMIT, axis=(1, 2))
-        path = [np.concatenate([start[k][:, None], x], axis=1) for k, x in zip(start, path, strict=True)]
-        path = [np.where(bad[:, None, None], part[:, :1], part) for part in path]
-        nv = self.scene.model.nv
+        course = found.pop("change", np.full((num, steps, len(change)), np.nan))
+        path, bad_steps = held({name: x[:, ::refined] for name, x in found.items()})
+        bad = bad_steps >= 0
         course = np.concatenate([np.tile(change, (num, 1, 1)), np.where(bad[:, None, None], 0.0, course)], axis=1)
-        coordinates = course[..., :nv]
-        if self.scene.model.nq != nv:
-            places = jnp.asarray(path[0])
-            coordinates = np.asarray(_coordinates(self.scene, places, jnp.asarray(coordinates, places.dtype)))
-        outcomes, derivatives = self._judge(tuple(lengths))(
-            (*path, controls, bad), (coordinates, course[..., nv : 2 * nv], course[..., 2 * nv :], pushes)
-        )
-        size = np.linalg.norm(course[:, list(lengths)], axis=2)
-        first = np.linalg.norm(change)
-        return Moved(np.asarray(outcomes), np.asarray(derivatives), size / (first or 1.0), int(bad.sum()))
-
-    def _run(self, kind: Kind, start: dict, controls: np.ndarray, changes: tuple, contact: dict) -> tuple:
-        """Return the path and its tangent."""
-        # The batch shares them, without a leading axis.
-        engine, numbers = engine_of(self.scene.mj_model), {k: np.asarray(v)[None] for k, v in contact.items()}
-        given = {"time": np.zeros((len(controls), 1)), **start}
-        if kind == "fine":
-            numbers["opt.timestep"] = np.asarray(self.scene.model.opt.timestep)[None] / REFINED
-            found = engine.run(numbers, given, {"ctrl": np.repeat(controls, REFINED, axis=1)})
-            path = [found[k][:, REFINED - 1 :: REFINED] for k in start]
-            return path, np.full((*controls.shape[:2], changes[0].shape[1]), np.nan)
-        found = engine.follow(kind, numbers, given, {"ctrl": controls}, changes)
-        return [found[k] for k in start], found["change"]
+        outcomes, derivatives = self._judge(tuple(lengths))(bad, (*path.values(), controls), course, pushes)
+        growth = np.linalg.norm(course[:, list(lengths)], axis=2) / (np.linalg.norm(change) or 1.0)
+        return Moved(np.asarray(outcomes), np.asarray(derivatives), growth, int(bad.sum()))
 
     def _judge(self, lengths: tuple[int, ...]) -> Callable:
         """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""
         if lengths in self._judges:
             return self._judges[lengths]
+        nv = self.scene.model.nv
 
-        def at_all(bad: Bool[Array, ""], qpos: Array, qvel: Array, act: Array, controls: Array) -> Array:
-            found = []
-            for length in lengths:
-                trajectory = Trajectory(
-                    qpos[: length + 1],
-                    qvel[: length + 1],
-                    controls[:length],
-                    observations=None,
-                    final=State(qpos[length], qvel[length], act[length], jnp.zeros(()), jnp.zeros_like(qvel[0])),
-                    diverged=bad,
-                    first_bad_step=jnp.where(bad, 0, -1),
-                    act=act[: length + 1],
-                )
-                found.append(jax.vmap(lambda one, t=trajectory: finite_cost(one, t))(self.outcomes(trajectory)))
-            return jnp.stack(found)
+        def at(length: int, bad: Array, qpos: Array, qvel: Array, act: Array, controls: Array) -> Array:
+            trajectory = Trajectory(
+                qpos[: length + 1],
+                qvel[: length + 1],
+                controls[:length],
+                observations=None,
+                final=State(qpos[length], qvel[length], act[length], jnp.zeros(()), jnp.zeros_like(qvel[0])),
+                diverged=bad,
+                first_bad_step=jnp.where(bad, 0, -1),
+                act=act[: length + 1],
+            )
+            return jax.vmap(lambda one: finite_cost(one, trajectory))(self.outcomes(trajectory))
 
-        def one(motion: tuple, change: tuple) -> tuple[Array, Array]:
-            qpos, qvel, act, controls, bad = motion
-            return jax.jvp(lambda *parts: at_all(bad, *parts), (qpos, qvel, act, controls), change)
+        def one(bad: Array, motion: tuple[Array, ...], course: Array, pushes: Array) -> tuple[Array, Array]:
+            parts = jnp.split(course, (nv, 2 * nv), axis=1)
+            parts[0] = jax.vmap(functools.partial(to_coordinates, self.scene))(motion[0], parts[0])
+            outcomes = lambda *motion: jnp.stack([at(length, bad, *motion) for length in lengths])  # noqa: E731
+            return jax.jvp(outcomes, motion, (*parts, pushes))
 
         return self._judges.setdefault(lengths, jax.jit(jax.vmap(one)))
-
-
-@eqx.filter_jit
-def _coordinates(scene: Scene, qpos: Float[Array, "a b nq"], change: Float[Array, "a b nv"]) -> Array:
-    return jax.vmap(jax.vmap(lambda q, v: to_coordinates(scene, q, v)))(qpos, change)
 
 
 def moved(
@@ -195,11 +168,6 @@ def moved(
     for one, place in zip(found, np.broadcast_to(places, len(found)), strict=True):
         mujoco.mj_integratePos(model, one, positions, float(place))
     return found
-
-
-def contact_of(model: mjx.Model) -> dict[str, Array]:
-    """Return the fields of a model that `Softness` changes, except margins."""
-    return {name: jnp.asarray(getattr(model, name)) for name in CONTACT_FIELDS}
 
 
 def compiler_options() -> dict | None:

@@ -225,9 +225,8 @@ class Sweep:
                 is_off = table[f"{name}_is_biased"] & (abs(table[f"{name}_bias"]) > _NONE * truth)
                 good: list[bool] = (~is_off & (width / 2 <= _BLIND * truth)).all(axis=1).tolist()  # pyright: ignore[reportAssignmentType]
                 until = good.index(False) if False in good else len(good)
-                where = (
-                    f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else f"at {sum(good)} of {len(good)}"
-                )
+                where = f"at {sum(good)} of {len(good)}"
+                where = f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else where
                 none = "nowhere" if is_off.any() else "too noisy to tell"
                 found.setdefault("everywhere" if all(good) else where if any(good) else none, []).append(words)
         return f"No bias above {_NONE:.0%} seen: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."

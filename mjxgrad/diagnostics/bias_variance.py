@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
 from mjxgrad._arrays import whole
 from mjxgrad._programs import compile_once
-from mjxgrad._text import format_number
+from mjxgrad._text import aligned, format_number
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
@@ -37,6 +37,7 @@ from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, sample
 from mjxgrad.objective import Objective, ParameterNoise
 from mjxgrad.objective.base import unchanged
+from mjxgrad.report import require
 from mjxgrad.scene import SceneWarning
 
 # The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
@@ -48,6 +49,7 @@ _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
 ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
 _LOOKS = {"first": ("#d55e00", "o", "-"), "zeroth": ("#0072b2", "s", "--"), "alpha_order": ("#009e73", "D", ":")}
+_NORMAL = 10**6  # samples, of which Student's t distribution is normal
 _TOO_STIFF = "without gaining energy"  # part of the warning about a contact that the time step cannot follow
 
 
@@ -116,9 +118,6 @@ def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree
 class BiasVariance(eqx.Module):
     """The measurements of `bias_variance`; the leading axes are `softness` × `points`.
 
-    The first axis of an interval holds its lower and upper end. Each interval has the coverage `confidence`: Student's t for
-    means and biases, percentile bootstrap for variances.
-
     Attributes:
         softness: the contact softnesses, stacked.
         params: the points.
@@ -131,15 +130,7 @@ class BiasVariance(eqx.Module):
         reference: the gradient of the smoothed cost, from separate rollouts: by a landscape, or the mean of many by an
             estimator that stays unbiased with wrong derivatives.
         reference_error: standard error of the reference.
-        bias: first order less reference.
-        bias_error: standard error of the bias, from both parts.
-        first_interval: interval of the mean first-order estimate; the intervals below are named alike.
-        zeroth_interval: interval of the mean zeroth-order estimate.
-        reference_interval: interval of the reference.
-        bias_interval: interval of the bias.
-        first_variance_interval: interval of the variance of one first-order sample.
-        zeroth_variance_interval: interval of the variance of one zeroth-order sample.
-        alpha_order_variance_interval: interval of the α-order variance per rollout.
+        variance_intervals: lower and upper end of each estimate's variance per rollout, by percentile bootstrap.
         landscape: the cost along the parameter at every softness; None unless there is a single parameter with noise.
         warnings: the warnings of the scene at each softness, such as a time step that is too long; often empty.
         confidence: coverage of every interval.
@@ -153,18 +144,29 @@ class BiasVariance(eqx.Module):
     cost: Float[Array, "softness points"]
     reference: Float[Array, "softness points dim"]
     reference_error: Float[Array, "softness points dim"]
-    bias: Float[Array, "softness points dim"]
-    bias_error: Float[Array, "softness points dim"]
-    first_interval: Float[np.ndarray, "2 softness points dim"]
-    zeroth_interval: Float[np.ndarray, "2 softness points dim"]
-    reference_interval: Float[np.ndarray, "2 softness points dim"]
-    bias_interval: Float[np.ndarray, "2 softness points dim"]
-    first_variance_interval: Float[np.ndarray, "2 softness points"]
-    zeroth_variance_interval: Float[np.ndarray, "2 softness points"]
-    alpha_order_variance_interval: Float[np.ndarray, "2 softness points"] | None
+    variance_intervals: dict[str, Float[np.ndarray, "2 softness points"]]
     landscape: Landscape | None
     warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
+
+    @property
+    def bias(self) -> Float[Array, "softness points dim"]:
+        """First order less reference."""
+        return self.first.value - self.reference
+
+    @property
+    def bias_error(self) -> Float[Array, "softness points dim"]:
+        """Standard error of the bias; the errors are independent, for the reference has separate rollouts."""
+        return jnp.hypot(self.first.standard_error, self.reference_error)
+
+    def interval(self, name: str) -> Float[np.ndarray, "2 softness points dim"]:
+        """Return Student's t interval of the mean `first`, `zeroth` or `alpha_order`, of the `bias` or the `reference`."""
+        # The reference averages so many cells or samples that its t distribution is normal.
+        if name == "reference":
+            return mean_interval(self.reference, self.reference_error, _NORMAL, self.confidence)
+        one = self.first if name == "bias" else getattr(self, name)
+        found = (self.bias, self.bias_error) if name == "bias" else (one.value, one.standard_error)
+        return mean_interval(*found, one.num_finite[..., None], self.confidence)
 
     @property
     def knob(self) -> tuple[str, Float[np.ndarray, " softness"]]:
@@ -191,12 +193,12 @@ class BiasVariance(eqx.Module):
             found.update({name: size, f"{name}_low": low, f"{name}_high": size + half})
             found[name.removesuffix("_bias") + "_is_biased"] = abs(size) > reach
 
-        add("truth", self.reference, self.reference_error, 10**6)
+        add("truth", self.reference, self.reference_error, _NORMAL)
         for name in ESTIMATES:
             if (one := getattr(self, name)) is not None:
                 error = np.hypot(one.standard_error, self.reference_error)
                 add(f"{name}_bias", one.value - self.reference, error, one.num_finite)
-                low, high = getattr(self, f"{name}_variance_interval")
+                low, high = self.variance_intervals[name]
                 found |= {f"{name}_variance": one.variance, f"{name}_variance_low": low, f"{name}_variance_high": high}
                 found["alpha"] = one.alpha
         return {name: np.asarray(value) for name, value in found.items() if name != "truth_is_biased"}
@@ -237,19 +239,16 @@ class BiasVariance(eqx.Module):
 
     def summary(self, labels: Sequence[str] | None = None) -> str:
         """Write the table for a terminal; labels name the softnesses in place of their numbers."""
-        columns = zip(*self.rows(labels), strict=True)
-        padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
-        return "\n".join(["  ".join(row).rstrip() for row in zip(*padded, strict=True)] + ["", *self.notes()])
+        return "\n".join([*aligned(self.rows(labels), str.ljust), "", *self.notes()])
 
     def __str__(self) -> str:
         return self.summary()
 
     def plot(self) -> Any:
         """Draw bias and variance against softness by matplotlib, one column per point, and return the figure."""
-        try:
-            import matplotlib.pyplot as plt
-        except ImportError as error:
-            raise ImportError("a picture needs matplotlib: pip install 'mjxgrad[render]'") from error
+        require()
+        import matplotlib.pyplot as plt
+
         table, (title, swept), points = self.table(), self.knob, len(self.params)
         settings = {"squeeze": False, "sharex": True, "sharey": "row", "layout": "constrained"}
         figure, axes = plt.subplots(2, points, figsize=(max(4.6, 3.2 * points), 5.4), **settings)
@@ -311,7 +310,7 @@ def bias_variance(
     """
     if jnp.ndim(params) != 2:
         raise ValueError(
-            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter write params[:, None]"
+            f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter params[:, None]"
         )
     params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
@@ -346,25 +345,12 @@ def bias_variance(
             if progress is not None:
                 progress(len(rows), count)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
-    variances = np.stack([row[1] for row in rows], axis=2)
-    first, zeroth, reference, error = (found[name] for name in ("first", "zeroth", "reference", "reference_error"))
-    # Independent errors: the reference has separate rollouts.
-    bias, bias_error = first.value - reference, jnp.hypot(first.standard_error, error)
-    count_first, count_zeroth = first.num_finite[..., None], zeroth.num_finite[..., None]
+    ends = np.stack([row[1] for row in rows], axis=2)
     return BiasVariance(
         **found,
         softness=stacked,
         params=params,
-        bias=bias,
-        bias_error=bias_error,
-        first_interval=mean_interval(first.value, first.standard_error, count_first, confidence),
-        zeroth_interval=mean_interval(zeroth.value, zeroth.standard_error, count_zeroth, confidence),
-        # The reference averages so many cells or samples that its t distribution is normal.
-        reference_interval=mean_interval(reference, error, 10**6, confidence),
-        bias_interval=mean_interval(bias, bias_error, count_first, confidence),
-        first_variance_interval=variances[0],
-        zeroth_variance_interval=variances[1],
-        alpha_order_variance_interval=variances[2] if has_alpha else None,
+        variance_intervals=dict(zip(ESTIMATES, ends, strict=False)),
         warnings=told,
         confidence=confidence,
     )
@@ -504,7 +490,5 @@ def _stacked(softness: PyTree) -> tuple[PyTree, int]:
     softness = jax.tree.map(jnp.asarray, softness)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
     if len(lengths) != 1 or () in lengths or (0,) in lengths:
-        raise ValueError(
-            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; see Softness.sweep"
-        )
+        raise ValueError(f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}")
     return softness, lengths.pop()[0]

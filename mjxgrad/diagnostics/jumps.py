@@ -73,9 +73,7 @@ def jumps_along(
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"interval must be two finite numbers, the smaller one first, got {interval}")
     if num_candidates < 1 or num_points < 2 or num_points % num_candidates:
-        raise ValueError(
-            f"num_points must be a multiple of num_candidates and at least 2, got {num_points} and {num_candidates}"
-        )
+        raise ValueError(f"num_points must be a multiple of num_candidates, got {num_points} and {num_candidates}")
     if num_refinements < 1:
         raise ValueError(f"num_refinements must be at least 1, got {num_refinements}: without one a slope is a jump")
     grid = np.linspace(low, high, num_points)
@@ -118,9 +116,7 @@ def _refine(
 def _evaluate(function: Callable, parameters: np.ndarray) -> np.ndarray:
     values = np.asarray(function(parameters), float)
     if values.shape[:1] != parameters.shape:
-        raise ValueError(
-            f"function must return one value per parameter, a leading axis of {len(parameters)}, got shape {values.shape}"
-        )
+        raise ValueError(f"function must return one value per parameter, {len(parameters)}, got shape {values.shape}")
     return values
 
 

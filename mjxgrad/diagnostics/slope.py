@@ -16,14 +16,13 @@ smooth weight also averages over teeth: it vanishes at the ends, where teeth are
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-# Fewest phases for four local slopes and eight blocks of the error bar, with four points each.
-_FEWEST_PHASES = 32
-_NUM_WINDOWS = 4
+_FEWEST_PHASES = 32  # for eight blocks of the error bar
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
 _ROUNDINGS = 1e3  # rounding errors of the outcome that many steps may add up
@@ -44,7 +43,6 @@ class SlopeComparison(eqx.Module):
         mean: mean of each derivative over the interval, weighted like the slope.
         mean_error: standard error of the mean.
         spread: standard deviation of each derivative over the phases.
-        local_slopes: slope of the outcome over each quarter of the interval.
         num_teeth: half the number of crossings of the outcome with its trend: about the number of teeth in the interval.
         num_finite: number of phases with finite outcome and derivatives; only these count.
         resolution: error of the slope by rounding of the outcome; smaller errors mean nothing.
@@ -59,7 +57,6 @@ class SlopeComparison(eqx.Module):
     mean: Float[np.ndarray, "gradients *outcome"]
     mean_error: Float[np.ndarray, "gradients *outcome"]
     spread: Float[np.ndarray, "gradients *outcome"]
-    local_slopes: Float[np.ndarray, "windows *outcome"]
     num_teeth: Float[np.ndarray, "*outcome"]
     num_finite: Int[np.ndarray, "*outcome"]
     resolution: Float[np.ndarray, "*outcome"]
@@ -68,20 +65,6 @@ class SlopeComparison(eqx.Module):
     def standard_error(self) -> Float[np.ndarray, "gradients *outcome"]:
         """Standard error of `error`, both parts taken as independent: one concerns mainly jumps, the other flanks."""
         return np.hypot(self.mean_error, self.slope_error)
-
-    @property
-    def irregularity(self) -> Float[np.ndarray, "*outcome"]:
-        """Deviation of the quarters' slopes from a straight line through them, over `scale`.
-
-        Small where a slope exists to compare with. It is of order one where the outcome is torn, by chaos or real
-        discontinuities, or where a quarter holds too few teeth.
-        """
-        place = np.arange(_NUM_WINDOWS) - (_NUM_WINDOWS - 1) / 2
-        centred = self.local_slopes - self.local_slopes.mean(axis=0)
-        tilt = np.tensordot(place, centred, axes=1) / (place**2).sum()
-        rest = centred - place.reshape(-1, *[1] * tilt.ndim) * tilt
-        size = np.abs(rest).max(axis=0)
-        return np.asarray(np.where(size > _NUM_WINDOWS * self.resolution, size, 0 * size) / self.scale)
 
     @property
     def error(self) -> Float[np.ndarray, "gradients *outcome"]:
@@ -147,65 +130,50 @@ def compare_to_slope(
     y, epsilon = y.astype(float), np.finfo(y.dtype if np.issubdtype(y.dtype, np.floating) else float).eps
     slopes = np.array([np.asarray(one, float) for one in derivatives])
     if slopes.shape != (len(gradients), *y.shape) or x.shape != y.shape[:1]:
-        raise ValueError(
-            "derivatives must hold one array of the outcomes' shape, whose first axis is that of the parameters, for "
-            f"each of {len(gradients)} gradients, got {slopes.shape} beside {y.shape} and {x.shape}"
-        )
+        expected = f"of the shape of outcomes, for each of {len(gradients)} gradients and {len(x)} parameters"
+        raise ValueError(f"derivatives must hold one array {expected}, got {slopes.shape} beside {y.shape}")
     if len(x) < _FEWEST_PHASES or not (np.diff(x) > 0).all():
         raise ValueError(f"parameters must be at least {_FEWEST_PHASES} and increase, got {len(x)}")
     width = (x[-1] - x[0]) * len(x) / (len(x) - 1)
     place = (x - (x[0] + x[-1]) / 2) / (width / 2)
     flat, flat_slopes = y.reshape(len(x), -1), slopes.reshape(len(slopes), len(x), -1)
-    columns = [_column(place, flat[:, j], flat_slopes[:, :, j]) for j in range(flat.shape[1])]
-    parts = [np.array([column[i] for column in columns]) for i in range(len(columns[0]))]
-    slope, slope_error, local_slopes, num_teeth, mean, mean_error, spread, num_finite = (
-        np.moveaxis(part, 0, -1).reshape((*part.shape[1:], *y.shape[1:])) for part in parts
-    )
+    columns = [_column(place, width / 2, flat[:, j], flat_slopes[:, :, j]) for j in range(flat.shape[1])]
+    stacked = {name: np.stack([column[name] for column in columns], axis=-1) for name in columns[0]}
     # Positive even for an outcome of zeros, since errors are divided by it.
     size = np.maximum(np.nanmax(np.abs(y), axis=0, initial=0), np.finfo(float).tiny)
     return SlopeComparison(
+        **{name: part.reshape((*part.shape[:-1], *y.shape[1:])) for name, part in stacked.items()},
         gradients=tuple(gradients),
         parameters=x,
         outcomes=y,
         derivatives=slopes,
-        slope=np.asarray(slope * 2 / width),
-        slope_error=np.asarray(slope_error * 2 / width),
-        mean=mean,
-        mean_error=mean_error,
-        spread=spread,
-        local_slopes=local_slopes * 2 / width,
-        num_teeth=num_teeth,
-        num_finite=num_finite.astype(int),
         resolution=np.asarray(_ROUNDINGS * epsilon * size / width),
     )
 
 
-def _column(u: np.ndarray, y: np.ndarray, slopes: Float[np.ndarray, "gradients phases"]) -> tuple:
-    """Compare a single outcome over the interval (-1, 1)."""
+def _column(u: np.ndarray, half: float, y: np.ndarray, slopes: Float[np.ndarray, "gradients phases"]) -> dict[str, Any]:
+    """Compare a single outcome over the interval (-1, 1), which is `half` times as wide in the parameter."""
     is_finite = np.isfinite(y) & np.isfinite(slopes).all(axis=0)
     count = int(is_finite.sum())
     if count < _FEWEST_PHASES:
-        nothing = np.full(len(slopes), np.nan)
-        return np.nan, np.nan, np.full(_NUM_WINDOWS, np.nan), np.nan, nothing, nothing, nothing, count
+        nothing = dict.fromkeys(("mean", "mean_error", "spread"), np.full(len(slopes), np.nan))
+        nothing |= dict.fromkeys(("slope", "slope_error", "num_teeth"), np.nan)
+        return {**nothing, "num_finite": count}
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
     weight = 1 - u**2
-    lever = _lever(u, weight)
+    lever = _lever(u, weight) / half
     # A trend of degree 3, since curvature is no error of the slope.
     rest = _residuals(u, y, weight, 3)
-    slope_error = _clustered(lever * rest)
     kernel = weight**2 / (weight**2).sum()
-    errors = np.array([_clustered(kernel * _residuals(u, one, weight**2, 1)) for one in slopes])
-    teeth = np.count_nonzero(np.diff(np.signbit(rest))) / 2
-    return (
-        lever @ y,
-        slope_error,
-        _local_slopes(u, y),
-        teeth,
-        slopes @ kernel,
-        errors,
-        slopes.std(axis=1, ddof=1),
-        count,
-    )
+    return {
+        "slope": lever @ y,
+        "slope_error": _clustered(lever * rest),
+        "num_teeth": np.count_nonzero(np.diff(np.signbit(rest))) / 2,
+        "mean": slopes @ kernel,
+        "mean_error": np.array([_clustered(kernel * _residuals(u, one, weight**2, 1)) for one in slopes]),
+        "spread": slopes.std(axis=1, ddof=1),
+        "num_finite": count,
+    }
 
 
 def _lever(u: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -235,11 +203,3 @@ def _clustered(terms: np.ndarray) -> float:
     blocks = np.array_split(terms, min(_MOST_BLOCKS, len(terms) // _POINTS_PER_BLOCK))
     sums = np.array([block.sum() for block in blocks])
     return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)))
-
-
-def _local_slopes(u: np.ndarray, y: np.ndarray) -> Float[np.ndarray, " windows"]:
-    found = []
-    for at, value in zip(np.array_split(u, _NUM_WINDOWS), np.array_split(y, _NUM_WINDOWS), strict=True):
-        half = (at[-1] - at[0]) / 2 * len(at) / (len(at) - 1)
-        found.append(_lever(at, 1 - ((at - (at[0] + at[-1]) / 2) / half) ** 2) @ value)
-    return np.array(found)

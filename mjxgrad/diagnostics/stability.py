@@ -12,7 +12,7 @@ $1 / d_w$ times these, where a row gets the whole acceleration that it asks for.
 
 import math
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,11 +20,10 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad._text import format_number, name_pairs
+from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
-from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
 from mjxgrad.scene import Scene
 
@@ -165,10 +164,10 @@ class StabilityReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence per finding, shared by equal springs; empty if the time step resolves every spring."""
-        rules = (_hidden, _unstable, _unstable_together, _short, _passed, _deep, _unresolved, _steep)
         found: dict[tuple[str, str], list[Spring]] = {}
         for spring in self.springs:
-            for text in filter(None, (rule(spring) for rule in rules)):
+            at_speed = () if spring.speed is None else _warnings_at(spring.speed, spring)
+            for text in (*_warnings_at_rest(spring), *at_speed):
                 found.setdefault((spring.kind, text), []).append(spring)
         return tuple(f"{kind} of {name_pairs(same)}: {text}" for (kind, text), same in found.items())
 
@@ -178,7 +177,8 @@ class StabilityReport:
         lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speed}"]
         if not self.springs:
             return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
-        lines += _aligned([_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()])
+        rows = [_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()]
+        lines += [f"  {line}" for line in aligned(rows)]
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)
         return "\n".join(
@@ -196,12 +196,11 @@ class StabilityReport:
             yield (f"{kind} {name_pairs(same)}", *cells)
 
     def _cells(self, spring: Spring) -> tuple[str, ...]:
-        low, high = (f"{x:.4g}" for x in spring.impedance)
         cells = (
             *map(format_number, (spring.stiffness, spring.damping, np.sqrt(max(spring.stiffness, 0.0)))),
             *map(format_number, (spring.damping_ratio, 1e3 * spring.time_constant)),
             format_number(1e3 * spring.given) if spring.is_hidden and spring.given is not None else "",
-            low if low == high else f"{low}–{high}",
+            format_range(spring.impedance),
             *map(format_number, (spring.load, spring.coupled_load, spring.num_steps)),
         )
         if self.speed is None:
@@ -212,91 +211,55 @@ class StabilityReport:
         return (*cells, depth, format_number(spring.rise_steps(spring.speed)))
 
 
-def _passed(spring: Spring) -> str | None:
-    if spring.speed is None or spring.speed * spring.timestep < spring.size:
-        return None
-    return (
-        f"at {spring.speed:.4g} m/s the bodies move {spring.speed * spring.timestep:.3g} m in one step, more than the "
-        f"{spring.size:.3g} m within "
-        f"which they are found, and can pass through; use a time step below {spring.size / spring.speed:.2g} s"
-    )
+def _warnings_at_rest(spring: Spring) -> Iterator[str]:
+    """Yield what is wrong with a spring at its time step, at any speed."""
+    step = spring.timestep
+    softness, direct = "Softness, which writes the format", "the direct format, a negative solref,"
+    remedy = f"{softness if spring.kind == 'contact' else direct} which refsafe leaves alone"
+    hidden = altered_by_refsafe(spring.given or 0.0, spring.damping, step, remedy)
+    yield from filter(None, (hidden, beyond_stability(*spring.steepest, step, spring.integrator)))
+    if spring.load < 1 <= spring.coupled_load:
+        yield (
+            f"stable alone, at {spring.load:.2g} of the largest time step, but not where {spring.num_rows} contacts act at "
+            f"once, at {spring.coupled_load:.2g} of it; use a time step below {format_number(step / spring.coupled_load)} s, "
+            "or an impedance nearer to 1"
+        )
+    if spring.kind != "equality" and spring.num_steps < STEPS_IN_CONTACT and spring.load < 1:
+        needed = format_number(step * spring.num_steps / STEPS_IN_CONTACT)
+        yield (
+            f"a bounce lasts {spring.num_steps:.2g} time steps, too few for the slope at MuJoCo's motion, which needs about "
+            f"{STEPS_IN_CONTACT:g}; use a time step below {needed} s, or a softer contact"
+        )
+    if spring.pyramid is not None and spring.pyramid < LEAST_FRICTION:
+        yield (
+            f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does "
+            f'not resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
+        )
 
 
-def _deep(spring: Spring) -> str | None:
-    speed = spring.speed
-    if speed is None or spring.depth(speed) < spring.size or speed * spring.timestep >= spring.size:
-        return None
-    # At a fixed damping ratio the depth is proportional to stiffness^(-1/2).
-    needed = spring.stiffness * (spring.depth(speed) / spring.size) ** 2 if spring.stiffness > 0 else np.inf
-    return (
-        f"at {speed:.4g} m/s a bounce goes {spring.depth(speed):.3g} m deep, more than the {spring.size:.3g} m from which bodies "
-        f"are pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
-    )
-
-
-def _steep(spring: Spring) -> str | None:
-    if spring.pyramid is None or spring.pyramid >= LEAST_FRICTION:
-        return None
-    return (
-        f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does not "
-        f'resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
-    )
-
-
-def _unresolved(spring: Spring) -> str | None:
-    if spring.speed is None:
-        return None
-    steps, jump = spring.rise_steps(spring.speed), spring.impedance[0]
+def _warnings_at(speed: float, spring: Spring) -> Iterator[str]:
+    """Yield what is wrong with a contact at a speed of approach."""
+    travel, depth = speed * spring.timestep, spring.depth(speed)
+    if travel >= spring.size:
+        yield (
+            f"at {speed:.4g} m/s the bodies move {travel:.3g} m in one step, more than the {spring.size:.3g} m within which "
+            f"they are found, and can pass through; use a time step below {spring.size / speed:.2g} s"
+        )
+    elif depth >= spring.size:
+        # At a fixed damping ratio the depth is proportional to stiffness^(-1/2).
+        needed = spring.stiffness * (depth / spring.size) ** 2 if spring.stiffness > 0 else np.inf
+        yield (
+            f"at {speed:.4g} m/s a bounce goes {depth:.3g} m deep, more than the {spring.size:.3g} m from which bodies are "
+            f"pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
+        )
+    steps, jump = spring.rise_steps(speed), spring.impedance[0]
     reasons = [f"begins with a jump, at an impedance of {jump:.3g}"] * (jump > LARGEST_JUMP)
     reasons += [f"rises within {steps:.2g} time steps"] * (steps < STEPS_NEEDED)
-    if not reasons:
-        return None
-    return (
-        f"at {spring.speed:.4g} m/s its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-        "contact=mg.Slope(), as tasks do by default, or an impedance from 0 over a width of at least "
-        f"{STEPS_NEEDED * spring.speed * spring.timestep:.2g} m"
-    )
-
-
-def _hidden(spring: Spring) -> str | None:
-    if not spring.is_hidden or spring.given is None:
-        return None
-    softness = "Softness, which writes the format that refsafe leaves alone"
-    direct = "the direct format, a negative solref, which refsafe leaves alone"
-    remedy = softness if spring.kind == "contact" else direct
-    return altered_by_refsafe(spring.given, spring.damping, spring.timestep, remedy)
-
-
-def _unstable(spring: Spring) -> str | None:
-    if spring.stiffness <= 0:
-        return None
-    return beyond_stability(*spring.steepest, spring.timestep, spring.integrator)
-
-
-def _unstable_together(spring: Spring) -> str | None:
-    if spring.load >= 1 or spring.coupled_load < 1:
-        return None
-    return (
-        f"stable alone, at {spring.load:.2g} of the largest time step, but not where {spring.num_rows} contacts act at once, "
-        f"at {spring.coupled_load:.2g} of it; use a time step below "
-        f"{format_number(spring.timestep / spring.coupled_load)} s, or an impedance nearer to 1"
-    )
-
-
-def _short(spring: Spring) -> str | None:
-    if spring.kind == "equality" or spring.num_steps >= STEPS_IN_CONTACT or spring.load >= 1:
-        return None
-    return (
-        f"a bounce lasts {spring.num_steps:.2g} time steps, too few for the slope at MuJoCo's motion, which needs about "
-        f"{STEPS_IN_CONTACT:g}; use a time step below {format_number(spring.timestep * spring.num_steps / STEPS_IN_CONTACT)} s, "
-        "or a softer contact"
-    )
-
-
-def _aligned(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    rows = list(rows)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows]
+    if reasons:
+        yield (
+            f"at {speed:.4g} m/s its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
+            f"contact=mg.Slope(), as tasks do by default, or an impedance from 0 over at least {STEPS_NEEDED * travel:.2g} m"
+        )
 
 
 def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityReport:
@@ -337,7 +300,8 @@ def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
     friction = np.asarray(parameters.friction[:, 0], float)
     is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     for i, pair in enumerate(scene.pairs):
-        kinds = tuple(mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2))
+        geoms = [pair.geom1, pair.geom2]
+        kinds = tuple(map(mujoco.mjtGeom, scene.mj_model.geom_type[geoms].tolist()))
         springiness = (stiffness[i], damping[i], solref[i], impedance[i], width[i])
         has_edges = is_pyramidal and pair.condim > 1 and scene.data.qpos.dtype == np.float32
         yield _spring(
@@ -345,7 +309,7 @@ def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
             "contact",
             str(pair),
             *springiness,
-            size=_thickness(scene, pair),
+            size=_thickness(scene, geoms, kinds),
             num_rows=most_contacts(kinds),
             pyramid=float(friction[i]) if has_edges else None,
             speed=speed,
@@ -394,20 +358,18 @@ def _spring(
     )
 
 
-def _thickness(scene: Scene, pair: ContactPair) -> float:
+def _thickness(scene: Scene, geoms: Sequence[int], kinds: Sequence[mujoco.mjtGeom]) -> float:
     """Return the joint thickness of two geoms, the deepest overlap from which they still part the way they came (m)."""
-    kinds = [mujoco.mjtGeom(int(scene.mj_model.geom_type[geom])) for geom in (pair.geom1, pair.geom2)]
-    # Everything behind a plane or under a height field is inside, at any depth.
-    if {mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD} & set(kinds):
-        return np.inf
-    return sum(_half_thickness(scene, geom, kind) for geom, kind in zip((pair.geom1, pair.geom2), kinds, strict=True))
-
-
-def _half_thickness(scene: Scene, geom: int, kind: mujoco.mjtGeom) -> float:
-    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
-        return float(scene.model.geom_size[geom, 0])
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        # Half extents of its bounding box, in its own axes.
-        return float(scene.mj_model.geom_aabb[geom, 3:].min())
-    sizes = np.asarray(scene.model.geom_size[geom], float)
-    return float(sizes[sizes > 0].min(initial=np.inf))
+    total, of = 0.0, mujoco.mjtGeom
+    for geom, kind in zip(geoms, kinds, strict=True):
+        # Half the thickness; everything behind a plane or under a height field is inside, at any depth.
+        sizes = np.asarray(scene.model.geom_size[geom], float)
+        if kind in (of.mjGEOM_PLANE, of.mjGEOM_HFIELD):
+            total = np.inf
+        elif kind in (of.mjGEOM_SPHERE, of.mjGEOM_CAPSULE):
+            total += sizes[0]
+        elif kind == of.mjGEOM_MESH:
+            total += scene.mj_model.geom_aabb[geom, 3:].min()  # of its bounding box, in its own axes
+        else:
+            total += sizes[sizes > 0].min(initial=np.inf)
+    return float(total)

@@ -3,38 +3,34 @@
 import csv
 import dataclasses
 import difflib
+import functools
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjxgrad.identification import parameters
 from mjxgrad.identification.inertia import inertia
-from mjxgrad.identification.parameters import (
-    Parameter,
-    armature,
-    damping,
-    friction,
-    friction_loss,
-    gains,
-    gear,
-    mass,
-    softness,
-)
-from mjxgrad.identification.recording import Recording
-from mjxgrad.rollouts import initial_state
+from mjxgrad.identification.parameters import Parameter
+from mjxgrad.identification.recording import Recording, start_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
 _Object = mujoco.mjtObj
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
-_NAMED = {"mass": mass, "damping": damping, "armature": armature, "friction_loss": friction_loss, "gear": gear}
-KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *list(_NAMED)[1:], "gains", "delay")
+_NAMED = ("mass", "damping", "armature", "friction_loss", "gear")
+KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
+_WRITTEN = (
+    *((kind, field) for kind in ("geom", "pair") for field in ("friction", "solref", "solimp")),
+    *(("actuator", field) for field in ("gear", "gainprm", "biasprm")),
+    *(("dof", field) for field in ("damping", "armature", "frictionloss")),
+    *(("body", field) for field in ("mass", "ipos", "inertia", "iquat")),
+)
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
 
@@ -51,9 +47,7 @@ def parameter(scene: Scene, text: str) -> Parameter:
     """
     match = re.fullmatch(r"(\w+)(?::([^=]+))?(?:=([^=]+?)\.\.([^=]+))?", text)
     if match is None or match[1] not in KINDS:
-        raise ValueError(
-            f"a parameter must be kind:name or kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}"
-        )
+        raise ValueError(f"a parameter must be kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}")
     kind, names = match[1], tuple((match[2] or "").split(",")) if match[2] else ()
     try:
         bounds = None if match[3] is None else (float(match[3]), float(match[4]))
@@ -69,14 +63,15 @@ def parameter(scene: Scene, text: str) -> Parameter:
         subset: dict[str, Any] = {"pairs": pairs} if pairs else {"geoms": names} if names else {}
         if bounds is not None:
             subset["bounds"] = bounds
-        return friction(scene, **subset) if kind == "friction" else softness(scene, kind, **subset)
+        make = parameters.friction if kind == "friction" else functools.partial(parameters.softness, part=kind)
+        return make(scene, **subset)
     if not names:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
     if kind in _NAMED:
-        return _NAMED[kind](scene, *names, bounds=bounds)
+        return getattr(parameters, kind)(scene, *names, bounds=bounds)
     if len(names) > 1 or (bounds is not None and kind == "inertia"):
         raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
-    return inertia(scene, *names) if kind == "inertia" else gains(scene, *names, bounds=bounds)
+    return inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
@@ -99,40 +94,32 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     columns = _read(Path(path))
     times = columns.pop("time", None)
     if times is None or len(times) < 2 or not (np.diff(times) > 0).all():
-        raise ValueError(
-            f"{path} must have a column named time, which increases (s), got {', '.join(columns) or 'nothing'}"
-        )
+        raise ValueError(f"{path} must have a column named time, increasing (s), got {', '.join(columns) or 'nothing'}")
     places, unknown = _places(scene.mj_model), []
-    widths = {key: getattr(scene.data, key).shape[0] for key in ("qpos", "qvel", "act", "ctrl")}
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
         place = places.get(name, ())
         if len(place) > 1:
-            raise ValueError(
-                f"{name} of {path} must say what it is, as one of {', '.join(sorted(f'{k}:{name}' for k, *_ in place))}"
-            )
+            kinds = ", ".join(sorted(f"{kind}:{name}" for kind, *_ in place))
+            raise ValueError(f"{name} of {path} must say what it is, as one of {kinds}")
         if not place:
             unknown.append(name)
             continue
-        key, signal, index, width = place[0]
-        whole = found.setdefault(signal, np.full((len(times), widths.get(key, width)), np.nan))
-        whole[:, index] = column
-    controls = found.pop("ctrl", None)
-    if scene.model.nu and (controls is None or not np.isfinite(controls).all()):
-        bad = range(scene.model.nu) if controls is None else np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist()
-        names = ", ".join(_name(scene.mj_model, _Object.mjOBJ_ACTUATOR, i) or f"[{i}]" for i in bad)
+        _, signal, index, width = place[0]
+        found.setdefault(signal, np.full((len(times), width), np.nan))[:, index] = column
+    controls = found.pop("ctrl", np.full((len(times), scene.model.nu), np.nan))
+    if bad := np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist():
+        names = ", ".join(mujoco.mj_id2name(scene.mj_model, _Object.mjOBJ_ACTUATOR, i) or f"[{i}]" for i in bad)
         raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; it lacks {names}")
     if not found:
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
-        raise ValueError(
-            f"{path} must have columns of the scene's joints or sensors, got {', '.join(unknown) or 'none'}"
-            + f"; did you mean {', '.join(near)}?" * bool(near)
-        )
-    start = _first(scene, found)
+        given = (", ".join(unknown) or "none") + f"; did you mean {', '.join(near)}?" * bool(near)
+        raise ValueError(f"{path} must have columns of the scene's joints or sensors, got {given}")
     noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
     at = times - times[0]
-    made = Recording(found, controls, at, None if controls is None else at, noise, start, name=str(path))
-    return made, tuple(unknown)
+    driven = {"controls": controls, "control_times": at} if scene.model.nu else {}
+    made = Recording(found, times=at, noise=noise, name=str(path), **driven)
+    return dataclasses.replace(made, start=start_of(scene, made, at)), tuple(unknown)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -140,11 +127,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             wholes = {name: np.asarray(arrays[name], float) for name in arrays}
-        wholes = {
-            name: value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value for name, value in wholes.items()
-        }
-        found = {name: value for name, value in wholes.items() if value.ndim == 1}
-        found |= {f"{n}[{i}]": v[:, i] for n, v in wholes.items() if v.ndim == 2 for i in range(v.shape[1])}
+        wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
+        found = {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
     else:
         with path.open(encoding="utf-8-sig", newline="") as file:
             names, *rows = [row for row in csv.reader(file) if row] or [[]]
@@ -154,14 +138,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         except ValueError as error:
             raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
     if len({len(column) for column in found.values()}) > 1:
-        raise ValueError(
-            f"all of {path} must have the same number of rows, got { ({n: len(c) for n, c in found.items()}) }"
-        )
+        raise ValueError(f"columns of {path} must be as long as time, got { ({n: len(c) for n, c in found.items()}) }")
     return found
-
-
-def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str | None:
-    return mujoco.mj_id2name(model, kind, index)
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
@@ -170,16 +148,16 @@ def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]
     own: list[tuple[str, str | None, str, Sequence[int], int]] = []
     ends = [*model.jnt_qposadr[1:], model.nq]
     for joint in range(model.njnt):
-        name = _name(model, _Object.mjOBJ_JOINT, joint)
+        name = mujoco.mj_id2name(model, _Object.mjOBJ_JOINT, joint)
         own.append(("qpos", name, "qpos", range(model.jnt_qposadr[joint], ends[joint]), model.nq))
         own.append(("qvel", name, "qvel", np.flatnonzero(model.dof_jntid == joint).tolist(), model.nv))
     for actuator in range(model.nu):
-        name = _name(model, _Object.mjOBJ_ACTUATOR, actuator)
+        name = mujoco.mj_id2name(model, _Object.mjOBJ_ACTUATOR, actuator)
         own.append(("ctrl", name, "ctrl", [actuator], model.nu))
         first, count = model.actuator_actadr[actuator], model.actuator_actnum[actuator]
         own.append(("act", name, "act", range(first, first + count) if first >= 0 else [], model.na))
     for index in range(model.nsensor):
-        name, width = _name(model, _Object.mjOBJ_SENSOR, index), int(model.sensor_dim[index])
+        name, width = mujoco.mj_id2name(model, _Object.mjOBJ_SENSOR, index), int(model.sensor_dim[index])
         own.append(("sensor", name, name or "", range(width), width))
     for kind, name, signal, indices, width in own:
         for i, index in enumerate(indices):
@@ -200,16 +178,6 @@ def column_names(scene: Scene) -> dict[tuple[str, int], str]:
     return {(signal, index): name for name, [(_, signal, index, _), *_] in places}
 
 
-def _first(scene: Scene, found: Mapping[str, np.ndarray]) -> Any:
-    """Return the state of the first row; missing parts are the scene's pose, at rest."""
-    given = {}
-    for key in ("qpos", "qvel", "act"):
-        if key in found:
-            row, default = found[key][0], np.asarray(getattr(scene.data, key))
-            given[key] = jnp.asarray(np.where(np.isfinite(row), row, default))
-    return initial_state(scene, **given)
-
-
 def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
     """Return the variation of each column; for positions, one number per velocity."""
     if name == "qpos":
@@ -222,11 +190,10 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
     return np.maximum(size, _SMALLEST_SIZE * size.max(initial=0.0)) if size.any() else np.ones_like(size)
 
 
-def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
+def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
     """Split recordings into those to fit and those held out: every n-th of several, or the end of a single one.
 
     Args:
-        scene: the scene of the recordings.
         recordings: all recordings.
         share: held-out share, below 1; 0 holds out nothing.
 
@@ -246,9 +213,8 @@ def hold_out(scene: Scene, recordings: Sequence[Recording], share: float) -> tup
     early = {name: value[~is_late] for name, value in whole.measured.items()}
     # The end starts where the recording does: positions and speeds in the middle may be unmeasured.
     late = {name: np.where(is_late[:, None], value, np.nan) for name, value in whole.measured.items()}
-    return [dataclasses.replace(whole, measured=early, times=times[~is_late])], [
-        dataclasses.replace(whole, measured=late)
-    ]
+    fitted = dataclasses.replace(whole, measured=early, times=times[~is_late])
+    return [fitted], [dataclasses.replace(whole, measured=late)]
 
 
 def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) -> None:
@@ -262,39 +228,25 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     """
     spec = mujoco.MjSpec.from_file(str(source))
     spec.compile()  # assigns element ids
-    before, after = numbers_of(scene.model), numbers_of(found.model)
-    changed = {n: np.asarray(v, float) for n, v in after.items() if not np.array_equal(v, before[n])}
-
-    def rows(*fields: str) -> list[int]:
-        parts = [
-            np.asarray(before[f] != changed[f]).reshape(len(changed[f]), -1).any(axis=1) for f in fields if f in changed
-        ]
-        return np.flatnonzero(np.any(parts, axis=0)).tolist() if parts else []
-
-    inertial = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
-    bodies = rows(*inertial)
-    parts = {
-        "geom": (("friction", "solref", "solimp"), spec.geoms, "geom_"),
-        "pair": (("friction", "solref", "solimp"), spec.pairs, "pair_"),
-        "actuator": (("gear", "gainprm", "biasprm"), spec.actuators, "actuator_"),
-    }
-    for fields, elements, prefix in parts.values():
-        for field in fields:
-            for row in rows(prefix + field):
-                target = next(one for one in elements if one.id == row)
-                value = changed[prefix + field][row]
-                setattr(target, field, value[: len(np.ravel(getattr(target, field)))])
-    for body in (one for one in spec.bodies if one.id in bodies):
-        values = [np.asarray(after[name], float)[body.id] for name in inertial]
-        body.explicitinertial = True
-        body.mass, body.ipos, body.inertia, body.iquat = float(values[0]), *values[1:]
-        body.fullinertia[:] = np.nan
-    for field in ("damping", "armature", "frictionloss"):
-        for dof in rows(f"dof_{field}"):
-            joint = next(one for one in spec.joints if one.id == scene.mj_model.dof_jntid[dof])
-            value = float(changed[f"dof_{field}"][dof])
-            present = getattr(joint, field)
-            setattr(joint, field, value if np.ndim(present) == 0 else np.array([value, *np.ravel(present)[1:]]))
+    elements = {"geom": spec.geoms, "pair": spec.pairs, "actuator": spec.actuators, "dof": spec.joints}
+    elements["body"] = spec.bodies
+    before, after = numbers_of(scene.model), {k: np.asarray(v, float) for k, v in numbers_of(found.model).items()}
+    for kind, field in _WRITTEN:
+        values = after[f"{kind}_{field}"]
+        differs = (np.asarray(before[f"{kind}_{field}"]) != values).any(axis=tuple(range(1, values.ndim)))
+        for row in np.flatnonzero(differs).tolist():
+            index = scene.mj_model.dof_jntid[row] if kind == "dof" else row
+            element = next(one for one in elements[kind] if one.id == index)
+            if kind == "body":
+                element.explicitinertial, element.mass = True, float(after["body_mass"][row])
+                place = [after[f"body_{name}"][row] for name in ("ipos", "inertia", "iquat")]
+                element.ipos, element.inertia, element.iquat = place
+                element.fullinertia[:] = np.nan
+                continue
+            present = np.array(getattr(element, field), float)
+            count = min(values[row].size, present.size)
+            present.ravel()[:count] = values[row].ravel()[:count]
+            setattr(element, field, present if present.ndim else float(present))
     for folder in ("meshdir", "texturedir"):
         there = Path(source).parent / (getattr(spec, folder) or "")
         setattr(spec, folder, os.path.relpath(there, Path(path).parent))

@@ -28,10 +28,7 @@ def identified_page(
         recordings: the fitted recordings.
         held_out: the held-out recordings.
     """
-    condition = (
-        f"Condition number {result.condition_number:.2g}: beyond 100 or so, single intervals are much wider than those of "
-        "combinations."
-    )
+    condition = f"Condition number {result.condition_number:.2g}: beyond 100, combinations have narrower intervals."
     head, *rows = result.rows()
     numbers = Block(faults=result.warnings(), items=[condition], table=Table(head, rows))
     # The held-out end of a single recording, else the first recording.
@@ -63,9 +60,7 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
         svg(lambda one=one: _panel(*one[1:], timestep=timestep, fitted_until=fitted_until), f"{one[1]} over time")
         for one in signals[:_MOST_SIGNALS]
     ]
-    caption = (
-        "SI units. Dots: measured. Dashed: at the start of the search. Line: with the values found. Grey: held out."
-    )
+    caption = "SI units. Dots: measured. Dashed: where the search began. Line: with the values found. Grey: held out."
     if len(signals) > len(drawings):
         caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
     return Block(drawings=drawings, caption=caption)

@@ -87,9 +87,8 @@ class Coordinates(eqx.Module):
             for name, p in parameters.items()
             for place in np.ndindex(p.nominal.shape)
         ]
-        return cls(
-            nominal, lower, upper, tuple(names), tuple((name, p.nominal.shape) for name, p in parameters.items())
-        )
+        shapes = tuple((name, p.nominal.shape) for name, p in parameters.items())
+        return cls(nominal, lower, upper, tuple(names), shapes)
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""
@@ -232,12 +231,10 @@ def friction_loss(scene: Scene, *joints: str, bounds: tuple[float, float] | None
 def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = None) -> Parameter:
     """Return the first gear number of an actuator, or the common one of several; otherwise as `mass`."""
 
-    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
-        index = np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators])
-        return {"actuator_gear": model.actuator_gear.at[index, 0].set(value)}
+    def place(model: mjx.Model) -> tuple:
+        return np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators]), 0
 
-    first = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuators[0])
-    return _positive(float(scene.model.actuator_gear[first, 0]), bounds, write, "", "gear")
+    return _common(scene, "actuator_gear", place, bounds, "gear")
 
 
 def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
@@ -262,23 +259,28 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
 
 
 def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[float, float] | None) -> Parameter:
-    def dofs(model: mjx.Model) -> np.ndarray:
+    def place(model: mjx.Model) -> tuple:
         index = [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]
-        return np.flatnonzero(np.isin(model.dof_jntid, index))
+        return (np.flatnonzero(np.isin(model.dof_jntid, index)),)
+
+    return _common(scene, field, place, bounds, field.removeprefix("dof_"))
+
+
+def _common(
+    scene: Scene, field: str, place: Callable[[mjx.Model], tuple], bounds: tuple[float, float] | None, name: str
+) -> Parameter:
+    """Return the common number at some places of a model's array."""
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
-        return {field: getattr(model, field).at[dofs(model)].set(value)}
+        return {field: getattr(model, field).at[place(model)].set(value)}
 
-    nominal = float(getattr(scene.model, field)[dofs(scene.model)[0]])
-    return _positive(nominal, bounds, write, "", field.removeprefix("dof_"))
+    return _positive(float(getattr(scene.model, field)[place(scene.model)][0]), bounds, write, "", name)
 
 
 def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: str, name: str) -> Parameter:
     nominal = np.asarray(nominal, float)
     if bounds is None:
         if not (nominal > 0).all():
-            raise ValueError(
-                f"bounds of {name} must be given where the model's is not positive, got {nominal.tolist()}"
-            )
+            raise ValueError(f"bounds of {name} must be given where it is not positive, got {nominal.tolist()}")
         bounds = (nominal / _FACTOR, nominal * _FACTOR)
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)

@@ -32,8 +32,7 @@ class Recording:
         control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
             (m, rad). The default is 1. Ratios weigh the signals; the overall size is estimated.
-        start: the state at time 0; None for the first row of "qpos" and "qvel" if it is at time 0, else the scene's pose, at
-            rest.
+        start: the state at time 0; None for what was measured then, else the scene's pose, at rest.
         name: name in messages.
     """
 
@@ -50,28 +49,22 @@ class Recording:
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
         if len(lengths) != 1:
-            raise ValueError(
-                f"measured and times of {self.name} must have the same number of rows, got {sorted(lengths)}"
-            )
+            raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {lengths}")
         count = len(self.controls) if self.controls is not None else None
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
+            needed = f"{count + 1} rows for {count} controls, one at each state"
             raise ValueError(
-                f"measured of {self.name} must have {count + 1} rows for {count} controls, one at each state, the first and "
-                f"last included, got {max(lengths)}: add what is missing, as NaN if need be, or give times"
+                f"measured of {self.name} must have {needed}, or times, got {max(lengths)}: NaN fills gaps"
             )
         for name in ("times", "control_times"):
             value = getattr(self, name)
             if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
-                raise ValueError(
-                    f"{name} of {self.name} must increase from 0 or later, got {np.asarray(value).tolist()}"
-                )
+                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
         for name, value in self.noise.items():
             if not (np.asarray(value) > 0).all():
-                raise ValueError(
-                    f"noise of {name} of {self.name} must be positive, got {np.asarray(value).tolist()}; inf weighs nothing"
-                )
+                raise ValueError(f"noise of {name} of {self.name} must be positive, or inf for no weight, got {value}")
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
         """Return windows of a duration, each from a measured state; a shorter remainder is dropped.
@@ -150,9 +143,9 @@ def _num_steps(recording: Recording, timestep: float) -> int:
     """Return the number of steps up to the last measurement; refuse more than there are controls."""
     needed = max(1, int(np.ceil(_times(recording, timestep)[-1] / timestep - 1e-6)))
     if recording.controls is not None and recording.control_times is None and needed > len(recording.controls):
+        given = len(recording.controls)
         raise ValueError(
-            f"controls of {recording.name} must have a row for each of {needed} steps up to the last measurement, "
-            f"got {len(recording.controls)}"
+            f"controls of {recording.name} must have a row for each of {needed} measured steps, got {given}"
         )
     return needed
 
@@ -176,14 +169,12 @@ def _window(
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
         if name == "qpos":  # an incomplete quaternion is useless
-            value, is_there = (
-                np.where(is_there, value, np.asarray(scene.data.qpos)),
-                _joints_there(scene.model, is_there),
-            )
+            value = np.where(is_there, value, np.asarray(scene.data.qpos))
+            is_there = _joints_there(scene.model, is_there)
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
     return Windows(
-        state=_start(scene, recording, times),
+        state=start_of(scene, recording, times),
         controls=jnp.asarray(_controls(scene, recording, num_steps, timestep)),
         index=jnp.asarray(np.pad(index, spare)),
         share=jnp.asarray(np.pad(place - index, spare)),
@@ -205,12 +196,13 @@ def _width(scene: Scene, name: str) -> int:
     return jax.eval_shape(lambda: sensor(scene.model, scene.data, name)).shape[0]
 
 
-def _start(scene: Scene, recording: Recording, times: np.ndarray) -> State:
+def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
+    """Return the state at time 0: the given one, else the first row; missing parts are the scene's pose, at rest."""
     if recording.start is not None:
         return recording.start
-    first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured}
-    known = {name: row for name, row in first.items() if times[0] == 0 and np.isfinite(row).all()}
-    return initial_state(scene, **known)
+    first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured and times[0] == 0}
+    whole = {name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
+    return initial_state(scene, **whole)
 
 
 def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:
@@ -219,7 +211,7 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
     controls = np.asarray(recording.controls, float)
     if controls.ndim != 2 or controls.shape[1] != scene.model.nu:
         raise ValueError(
-            f"controls of {recording.name} must have {scene.model.nu} columns in this scene, got shape {controls.shape}"
+            f"controls of {recording.name} must have {scene.model.nu} columns in this scene, got {controls.shape}"
         )
     if recording.control_times is not None:
         at = timestep * np.arange(num_steps)
@@ -281,5 +273,5 @@ def residuals(
             change = jax.vmap(position_change, (None, 0, 0))(scene.model, measured, change)
         else:
             change -= measured
-        parts.append((change * window.weight[name]).ravel())
-    return jnp.concatenate(parts), diverged
+        parts.append(change * window.weight[name])
+    return jnp.concatenate(parts, axis=1).ravel(), diverged

@@ -21,7 +21,7 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from mjxgrad._text import format_number
+from mjxgrad._text import aligned, format_number
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
@@ -138,7 +138,7 @@ class Identification:
                 f"{head}, {self.stopped.value}.",
                 f"{rms}.",
                 "",
-                *self._table(),
+                *aligned(self.rows()),
                 *[f"\n{line}" for line in self.warnings()],
             ]
         )
@@ -152,15 +152,9 @@ class Identification:
         for name, found, half, start, (low, high) in zip(self.names, *columns, bounds, strict=True):
             unit = self.units.get(name.split("[")[0], "")
             shown = (_digits(found, half), f"{half:.2g}" if np.isfinite(half) else "unknown", format_number(start))
-            rows.append(
-                (f"{name} ({unit})" if unit else name, *shown, f"{format_number(low)} to {format_number(high)}")
-            )
+            title = f"{name} ({unit})" if unit else name
+            rows.append((title, *shown, f"{format_number(low)} to {format_number(high)}"))
         return rows
-
-    def _table(self) -> list[str]:
-        rows = self.rows()
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
     def warnings(self) -> list[str]:
         """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""
@@ -189,7 +183,7 @@ class Identification:
             found.append(f"Cannot be told apart: {', '.join(combination)}. {changes} changes nothing measured.")
         if self.at_bounds:
             found.append(
-                f"At a bound: {', '.join(self.at_bounds)}. The data ask for more; widen it, or doubt the model."
+                f"At a bound: {', '.join(self.at_bounds)}. The data ask for more; widen it or doubt the model."
             )
         return found
 
@@ -199,9 +193,8 @@ class Identification:
         Args:
             path: path of the file.
         """
-        lower, upper = (
-            self.coordinates.unravel(np.asarray(x)) for x in (self.coordinates.lower, self.coordinates.upper)
-        )
+        bounds = self.coordinates.lower, self.coordinates.upper
+        lower, upper = (self.coordinates.unravel(np.asarray(x)) for x in bounds)
         lines = []
         for name, value in self.values.items():
             parts = {"nominal": self.start[name], "min_value": lower[name], "max_value": upper[name], "value": value}

@@ -16,11 +16,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.optimize
 from jaxtyping import Array, Float
 
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
-from mjxgrad.identification.particles import best_point
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
@@ -36,7 +36,7 @@ _FIRST_SIZE = 3.0  # with less, the first step may go too far to recover
 _GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix's 0.99 keeps it too long
 # Least gain as a share of the noise variance, and steps in a row below it: badly determined parameters make it creep.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
-_NUM_POINTS = 256  # of the search between the bounds
+_NUM_POINTS, _NUM_GENERATIONS = 256, 60  # of the search between the bounds
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
 _DIVERGED = 1e30  # sum of squares of a diverged motion
 _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
@@ -58,7 +58,7 @@ def identify(
 
     Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
     derivatives through the simulation. Where it leaves more than the stated noise, as where contacts chatter, a second
-    descent begins at the best of many points between the bounds; not with `free_start`. Needs optimistix
+    descent begins where differential evolution ends between the bounds; not with `free_start`. Needs optimistix
     (`pip install 'mjxgrad[identify]'`).
 
     Args:
@@ -97,9 +97,8 @@ def identify(
     end = _descend(program, start, max_steps, log)
     has_noise = all(set(one.noise) == set(one.measured) for one in recordings)
     if has_noise and not free_start and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
-        begin = program.searched()
-        again = None if begin is None else _descend(program, begin, max_steps, log)
-        if again is not None and _rms(program, again.found) < _rms(program, end.found):
+        again = _descend(program, program.searched(), max_steps, log)
+        if _rms(program, again.found) < _rms(program, end.found):
             end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
     return _identified(program, end, held_out, has_noise)
 
@@ -205,17 +204,11 @@ class _Program:
 
         return jax.vmap(one)(windows, offsets)
 
-    def _sums(self, windows: Windows, vectors: Array) -> Float[Array, "points rows"]:
-        """Return for each vector the sum of squares over all windows, cumulative over their rows."""
-        ends = np.cumsum([math.prod(weight.shape[1:]) for weight in windows.weight.values()])[:-1]
-
-        def of_window(vector: Array, window: Windows) -> Array:
-            squares = self._residuals(vector, None, window) ** 2
-            of_rows = [part.reshape(len(window.index), -1).sum(axis=1) for part in jnp.split(squares, ends)]
-            return jnp.stack(of_rows).sum(axis=0)
+    def _sums(self, windows: Windows, vectors: Array) -> Float[Array, " points"]:
+        """Return for each vector the sum of squares over all windows."""
 
         def of_one(vector: Array) -> Array:
-            return jnp.cumsum(jax.vmap(functools.partial(of_window, vector))(windows).sum(axis=0))
+            return jnp.sum(jax.vmap(lambda window: self._residuals(vector, None, window))(windows) ** 2)
 
         return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
 
@@ -234,19 +227,26 @@ class _Program:
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
-    def searched(self) -> Array | None:
-        """Return the best of many points between the bounds, by `particles`; None if none explains the recordings."""
+    def searched(self) -> Array:
+        """Return the best of many points between the bounds, by differential evolution.
+
+        Hard contacts chatter: each switch of a contact makes the later motion jump, and the sum of squares has a minimum in
+        every cell between two jumps. Descent ends in the first of them.
+        """
         dtype = self.coordinates.nominal.dtype
-        counts = sum((np.asarray(weight) > 0).sum(axis=(0, 2)) for weight in self.windows.weight.values())
         low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
 
-        def sums_at(points: np.ndarray) -> np.ndarray:
-            vectors = self.coordinates.values(jnp.asarray(points, dtype))
+        def sums_at(points: Float[np.ndarray, "dim points"]) -> Float[np.ndarray, " points"]:
+            vectors = self.coordinates.values(jnp.asarray(points.T, dtype))
             found = np.asarray(self._run(self._sums, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
-        best = best_point(sums_at, low, high, np.cumsum(counts).astype(float), _NUM_POINTS)
-        return None if best is None else jnp.asarray(best, dtype)
+        points = np.random.default_rng(0).uniform(low, high, (_NUM_POINTS, len(low)))
+        points[0] = 0.0  # the nominal values, at which no motion diverges
+        settings: dict[str, Any] = {"maxiter": _NUM_GENERATIONS, "init": points, "rng": 0}
+        settings |= {"polish": False, "vectorized": True, "updating": "deferred"}
+        best = scipy.optimize.differential_evolution(sums_at, list(zip(low, high, strict=True)), **settings)
+        return jnp.asarray(best.x, dtype)
 
     def offsets(self, point: Array) -> Array | None:
         """Return the offsets of the starts in a point, one row per window; None if starts are known."""
@@ -259,7 +259,7 @@ class _Program:
         if not held_out:
             return None
         judged, vectors = stack(self.nominal, held_out), jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
-        sums = compile_once(jax.jit(self._sums).lower(judged, vectors))(judged, vectors)[:, -1]
+        sums = compile_once(jax.jit(self._sums).lower(judged, vectors))(judged, vectors)
         first, last = np.sqrt(np.asarray(sums, float) / _num_numbers(judged))
         return float(first), float(last)
 
@@ -343,9 +343,8 @@ def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
     along = axes.T @ (columns.T @ residual)
     is_clear = sizes > jnp.sqrt(jnp.finfo(sizes.dtype).eps) * jnp.max(sizes)
     total = jnp.sum(residual**2)
-    return jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0)) / jnp.where(
-        total > 0, total, 1.0
-    )
+    removed = jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0))
+    return removed / jnp.where(total > 0, total, 1.0)
 
 
 def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, size: float) -> tuple[Array, Array, Array]:
@@ -364,14 +363,9 @@ def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, siz
 
 def _correlation(windows: Windows, residual: np.ndarray) -> float:
     """Return the correlation of residuals with those of the same signal one time before, from -1 to 1."""
-    products = squares = 0.0
-    shapes = [weight.shape for weight in windows.weight.values()]
-    ends = np.cumsum([math.prod(shape[1:]) for shape in shapes])
-    for shape, part in zip(shapes, np.split(residual, ends[:-1], axis=1), strict=True):
-        signal = part.reshape(shape)
-        products += float((signal[:, 1:] * signal[:, :-1]).sum())
-        squares += float((signal**2).sum())
-    return products / squares if squares else 0.0
+    signals = residual.reshape(*windows.index.shape, -1)
+    squares = float((signals**2).sum())
+    return float((signals[:, 1:] * signals[:, :-1]).sum()) / squares if squares else 0.0
 
 
 def _without_offsets(

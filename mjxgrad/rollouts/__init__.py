@@ -1,4 +1,4 @@
-"""Rollouts of a scene by MJX or C MuJoCo, with states, trajectories, linear models, adaptive integration and rendering."""
+"""Rollouts of a scene by MJX or C MuJoCo, with states, trajectories, linear models and rendering."""
 
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees
 from mjxgrad.rollouts.linearisation import Linearisation, linearise

@@ -12,7 +12,7 @@ from mjxgrad._arrays import form, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad.native import INPUTS
 from mjxgrad.rollouts.state import State
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneError
 from mjxgrad.stepping import Contact, OwnMotion, check_contact
 
 Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
@@ -25,9 +25,7 @@ Sees = Literal["state", "observations"]
 def check_policy_sees(policy_sees: str, observe: Observe | None) -> None:
     """Refuse to show a policy observations that do not exist."""
     if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
-        raise ValueError(
-            f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}, {observe=}'
-        )
+        raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
 
 
 def sequence_of(
@@ -71,20 +69,26 @@ def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) 
 
 
 def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
-    """Check how contact is stepped, and return it where C MuJoCo steps it, None where MJX does."""
+    """Check how contact is stepped, and return it where C MuJoCo steps it, None where MJX does and can."""
     check_contact(contact)
     if isinstance(contact, OwnMotion) and (contact.engine or scene.engine) == "mujoco":
         return contact
+    if scene.unsupported:
+        raise SceneError(scene.unsupported)
     return None
 
 
-def one_each(chosen: Any, num_controls: int) -> Float[Array, " nu"]:
+def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return a state, and the scene's resting inputs beside controls, as `native` takes them."""
+    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
+    return start, {name: getattr(scene.data, name) for name in INPUTS[1:] if getattr(scene.data, name).size}
+
+
+def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:
     """Refuse controls of a policy unless there is one per actuator: other shapes would silently be added or broadcast."""
     chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen
-    if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (num_controls,):
-        raise ValueError(
-            f"the policy must return one control per actuator, shape ({num_controls},), got {form(chosen)}"
-        )
+    if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (count,):
+        raise ValueError(f"the policy must return one control per actuator, shape ({count},), got {form(chosen)}")
     return jnp.asarray(chosen)
 
 

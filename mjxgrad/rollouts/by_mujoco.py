@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from mjxgrad.native import INPUTS, roll_out
-from mjxgrad.rollouts.arguments import Policy, one_each
+from mjxgrad.native import roll_out
+from mjxgrad.rollouts.arguments import Policy, arguments_of, one_each
 from mjxgrad.rollouts.state import State, direction, is_sound
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
@@ -56,18 +56,12 @@ def _course(
     scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: _Inputs, gradient: Gradient
 ) -> Trajectory:
     """Return the motion under known controls: one call of C MuJoCo."""
-    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
     is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
-    given = {
-        name: jnp.broadcast_to(getattr(scene.data, name), (len(ctrl), *getattr(scene.data, name).shape))
-        for name in INPUTS[1:]
-        if getattr(scene.data, name).size
-    }
+    start, resting = arguments_of(scene, state)
+    given = {name: jnp.broadcast_to(value, (len(ctrl), *value.shape)) for name, value in resting.items()}
     found = roll_out(scene, start, given | inputs | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
-    qpos, qvel, act = (
-        jnp.concatenate([first[None], rest])
-        for first, rest in zip((state.qpos, state.qvel, state.act), found, strict=True)
-    )
+    begin = (state.qpos, state.qvel, state.act)
+    qpos, qvel, act = (jnp.concatenate([first[None], rest]) for first, rest in zip(begin, found, strict=True))
     time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
     states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
     is_bad = ~(jax.vmap(is_sound)(states)[1:] & jnp.all(is_finite, axis=1))

@@ -6,9 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native import INPUTS
 from mjxgrad.native import linearise as by_mujoco
-from mjxgrad.rollouts.arguments import native_motion
+from mjxgrad.rollouts.arguments import arguments_of, native_motion
 from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Slope, step
@@ -50,11 +49,10 @@ def linearise(
     ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
     native = native_motion(scene, contact)
     if native is not None:
-        start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
-        inputs = {name: getattr(scene.data, name)[None] for name in INPUTS[1:] if getattr(scene.data, name).size}
-        found = by_mujoco(scene, start, inputs | {"ctrl": ctrl[None]}, native.gradient)
+        start, resting = arguments_of(scene, state)
+        inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
+        found = by_mujoco(scene, start, inputs, native.gradient)
         return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
-    scene.check_mjx()
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
     end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
 

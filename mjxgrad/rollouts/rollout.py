@@ -7,17 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float, PyTree
 
 from mjxgrad._programs import is_traced
-from mjxgrad.rollouts import by_mjx, by_mujoco
-from mjxgrad.rollouts.arguments import (
-    Observe,
-    Policy,
-    Sees,
-    applied,
-    check_policy_sees,
-    check_shapes,
-    native_motion,
-    sequence_of,
-)
+from mjxgrad.rollouts import arguments, by_mjx, by_mujoco
+from mjxgrad.rollouts.arguments import Observe, Policy, Sees
 from mjxgrad.rollouts.state import State, check_scene
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene, SceneWarning
@@ -80,14 +71,14 @@ def rollout(
     check_scene(scene)
     if not isinstance(state, State):
         raise ValueError(f"state must be of mg.initial_state, or the end of a rollout, got {type(state).__name__}")
-    native = native_motion(scene, contact)
+    native = arguments.native_motion(scene, contact)
     for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    check_policy_sees(policy_sees, observe)
+    arguments.check_policy_sees(policy_sees, observe)
     policy = controls if callable(controls) else None
-    sequence, horizon = sequence_of(controls, noise, horizon, scene.model.nu)
-    check_shapes(scene, state)
-    forces = applied(scene, inputs, horizon)
+    sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
+    arguments.check_shapes(scene, state)
+    forces = arguments.applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     if native is not None:
         if observe is not None:
@@ -95,7 +86,6 @@ def rollout(
         added = jnp.zeros(base.shape, state.qvel.dtype) if noise is None else jnp.asarray(noise)
         given = (base + added if policy is None else policy, params, added, forces, native.gradient)
         return by_mujoco.rolled_out(scene, state, *given, measure_growth=measure_growth)
-    scene.check_mjx()
     rows = (base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     settings = by_mjx.Settings(policy_sees, checkpoint, contact, measure_growth)
     given = (scene, state, rows, policy, params if policy is not None else None, observe, settings)

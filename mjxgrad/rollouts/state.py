@@ -101,21 +101,15 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
     units = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
     has_limits = not model.opt.disableflags & _NO_LIMITS
     for joint, (kind, first) in enumerate(zip(model.jnt_type, model.jnt_qposadr, strict=True)):
-        value, (low, high) = pose[first], ranges[joint]
-        quaternion = pose[first + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE) :][:4]
-        slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
-        is_within = (
-            kind not in units or not has_limits or not model.jnt_limited[joint] or low - slack <= value <= high + slack
-        )
-        if is_within and (kind in units or quaternion.any()):
-            continue
         name = mjx.id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint {joint}"
-        if is_within:
-            raise ValueError(
-                f"qpos must have a quaternion that is not zero, got zeros for {name}; no turn is 1, 0, 0, 0"
-            )
-        unit = units[int(kind)]
-        yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
+        if kind not in units:
+            if not pose[first + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE) :][:4].any():
+                raise ValueError(f"qpos must have a quaternion that is not zero, got zeros for {name}")
+        elif has_limits and model.jnt_limited[joint]:
+            unit, value, (low, high) = units[int(kind)], pose[first], ranges[joint]
+            slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
+            if not low - slack <= value <= high + slack:
+                yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
     if of_file is None:
         return
     data = mujoco.MjData(of_file)

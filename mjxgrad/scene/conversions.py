@@ -14,7 +14,7 @@ import numpy as np
 from mjxgrad._mjx import mjx
 from mjxgrad._text import name_pairs
 from mjxgrad.contact.parameters import contact_pairs, deciding_geoms
-from mjxgrad.scene.refusals import element_name, has_constraints, has_friction_loss, has_limits, has_medium
+from mjxgrad.scene.refusals import ACTUATORS, element_name, has_constraints, has_friction_loss, has_limits, has_medium
 
 _DISABLE = mujoco.mjtDisableBit
 _ENABLE = mujoco.mjtEnableBit
@@ -51,11 +51,7 @@ def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
     for flag, reason, exact in (
         (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only", True),
         (_ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing", True),
-        (
-            _ENABLE.mjENBL_SLEEP,
-            "bodies at rest are stepped too, not frozen below sleep_tolerance as in C MuJoCo",
-            False,
-        ),
+        (_ENABLE.mjENBL_SLEEP, "bodies at rest are stepped too, not frozen as in C MuJoCo", False),
     ):
         if model.opt.enableflags & flag.value:
             model.opt.enableflags &= ~flag.value
@@ -76,15 +72,11 @@ def _solver(model: mujoco.MjModel) -> Iterator[Conversion]:
     if given == mujoco.mjtSolver.mjSOL_NEWTON:
         return
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and any(
-        pair.condim > 1 for pair in contact_pairs(model)
-    )
-    if given == mujoco.mjtSolver.mjSOL_PGS and elliptic:
-        reason = "with elliptic cones PGS stops short of the optimum that Newton finds"
-        yield Conversion("solver", "PGS", "Newton", reason, exact=False)
-    else:
-        name = mujoco.mjtSolver(given).name.removeprefix("mjSOL_")
-        yield Conversion("solver", name, "Newton", "the same convex problem, the same optimum")
+    is_elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and any(p.condim > 1 for p in contact_pairs(model))
+    is_exact = given != mujoco.mjtSolver.mjSOL_PGS or not is_elliptic
+    reason = "the same convex problem, the same optimum"
+    reason = reason if is_exact else "with elliptic cones PGS stops short of the optimum that Newton finds"
+    yield Conversion("solver", mujoco.mjtSolver(given).name.removeprefix("mjSOL_"), "Newton", reason, is_exact)
 
 
 def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -99,30 +91,6 @@ def _no_passive_forces(model: mujoco.MjModel) -> Iterator[Conversion]:
         model.opt.disableflags |= _EULERDAMP
         reason = "with the damper flag disabled C MuJoCo integrates no damping, MJX would"
         yield Conversion("flag eulerdamp", "enable", "disable", reason)
-
-
-def _actuator_inertia(model: mujoco.MjModel) -> Iterator[Conversion]:
-    """Move armature and damping of an actuator, scaled by its gear, to its target."""
-    if not (model.actuator_armature.any() or model.actuator_damping.any()):
-        return
-    tendons = np.arange(model.ntendon)
-    targets = (
-        ("joint", model.jnt_actuatorid, model.jnt_dofadr, model.dof_armature, model.dof_damping),
-        ("tendon", model.tendon_actuatorid, tendons, model.tendon_armature, model.tendon_damping),
-    )
-    for word, actuators, addresses, armature, damping in targets:
-        for target, actuator in enumerate(actuators.tolist()):
-            if actuator < 0:
-                continue
-            gear = model.actuator_gear[model.actuator_outadr[actuator], 0]
-            address = addresses[target]
-            armature[address] += gear**2 * model.actuator_armature[actuator]
-            damping[address] += gear**2 * model.actuator_damping[actuator]
-            actuators[target] = -1
-            name = element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, actuator)
-            used, reason = f"of its {word}, times gear²", "a constant gear makes the two the same"
-            yield Conversion(f"{name} armature, damping", "of the actuator", used, reason)
-    model.actuator_armature[:] = model.actuator_damping[:] = 0.0
 
 
 def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -186,14 +154,9 @@ def kinematics_alone(model: mujoco.MjModel) -> mujoco.MjModel:
     bare.opt.cone, bare.opt.enableflags, bare.opt.noslip_iterations = mujoco.mjtCone.mjCONE_PYRAMIDAL, 0, 0
     bare.geom_contype[:] = bare.geom_conaffinity[:] = 0
     bare.geom_type[np.concatenate([bare.pair_geom1, bare.pair_geom2])] = _SPHERE
-    for of, enumeration, used in (
-        ("actuator_trntype", mjx.TrnType, mujoco.mjtTrn.mjTRN_JOINT),
-        ("actuator_dyntype", mjx.DynType, mujoco.mjtDyn.mjDYN_NONE),
-        ("actuator_gaintype", mjx.GainType, mujoco.mjtGain.mjGAIN_FIXED),
-        ("actuator_biastype", mjx.BiasType, mujoco.mjtBias.mjBIAS_NONE),
-    ):
-        kinds = getattr(bare, of)
-        kinds[~np.isin(kinds, [int(kind) for kind in enumeration])] = used
+    for _, field, known, *_ in ACTUATORS:
+        kinds = getattr(bare, field)
+        kinds[~np.isin(kinds, [int(kind) for kind in known])] = 0  # at a joint, no dynamics, a fixed gain, no bias
     bare.eq_type[~np.isin(bare.eq_type, [int(kind) for kind in mjx.EqType])] = mujoco.mjtEq.mjEQ_CONNECT
     list(drop_sensors(bare))
     return bare
@@ -212,7 +175,7 @@ def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:
 _Rules = tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...]
 # The first group avoids refusals and runs before them, the second runs after them.
 BEFORE_REFUSALS: _Rules = (_flags, _wind)
-AFTER_REFUSALS: _Rules = (_solver, _no_passive_forces, _actuator_inertia, _least_friction, _implicitfast)
+AFTER_REFUSALS: _Rules = (_solver, _no_passive_forces, _least_friction, _implicitfast)
 
 # The stage; why it is left out without elements; whether there are any; the flag that disables it.
 _STAGES = (

@@ -53,9 +53,8 @@ def load_scene(
 
     C MuJoCo steps a scene that MJX cannot, with derivatives, too: see `scene.engine`, and `scene.unsupported` for the reason.
 
-    Arrays are float64 if `jax_enable_x64` is set and float32 otherwise. In float32 a solver
-    tolerance below 1e-6 is raised to it. Float32 does not resolve a smaller scaled improvement or
-    gradient, and the solver would run into its iteration limit.
+    Arrays are float64 if `jax_enable_x64` is set. Float32 otherwise raises a solver tolerance below 1e-6, which the solver
+    would never reach.
 
     Args:
         source: path of an MJCF file, MJCF as a string, a `MjSpec` or a C model; neither is changed.
@@ -179,7 +178,7 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
         model.names.decode()
     except UnicodeDecodeError as error:
         raise SceneError(
-            f"{name} must have names in UTF-8, got {model.names[error.start :][:1]!r}; save it as UTF-8"
+            f"{name} must have names in UTF-8, got {error.object[error.start :][:1]!r}; save it so"
         ) from None
     if model.nv == 0:
         reason = "so that nothing can move; give a body a joint"

@@ -11,14 +11,16 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import has_collision_fn, mjx
-from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.contact.parameters import ContactPair, contact_pairs
 
 _OBJECT = mujoco.mjtObj
 _ENABLE = mujoco.mjtEnableBit
 _DISABLE = mujoco.mjtDisableBit
 _GEOM = mujoco.mjtGeom
+_INTEGRATOR = mujoco.mjtIntegrator
 _SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
-_SEARCHED = (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER)
+_SEARCHED = {_GEOM.mjGEOM_ELLIPSOID.value, _GEOM.mjGEOM_CYLINDER.value}
+_SMOOTH = _SEARCHED | {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CAPSULE.value}
 
 
 def element_name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
@@ -39,13 +41,13 @@ def _where(kind: mujoco.mjtObj, condition: Callable[[mujoco.MjModel], np.ndarray
     return find
 
 
-def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: type, prefix: str):
+def _unknown_type(kind: mujoco.mjtObj, field: str, ours: type[IntEnum], theirs: type):
     """Return a function that names elements whose type MJX does not know, with this type."""
 
     def find(model: mujoco.MjModel) -> list[str]:
         known = {int(member) for member in ours}
         return [
-            f"{element_name(model, kind, i)} ({theirs(t).name.removeprefix(prefix).lower()})"
+            f"{element_name(model, kind, i)} ({theirs(t).name.partition('_')[2].lower()})"
             for i, t in enumerate(getattr(model, field))
             if int(t) not in known
         ]
@@ -60,12 +62,6 @@ def _when(condition: Callable[[mujoco.MjModel], bool], given: str | Callable):
         return [given(model) if callable(given) else given] if condition(model) else []
 
     return find
-
-
-def _integrator(model: mujoco.MjModel) -> Iterator[str]:
-    kind = mujoco.mjtIntegrator(model.opt.integrator)
-    if kind in (kind.mjINT_IMPLICIT, kind.mjINT_DISCRETE):
-        yield f"integrator={kind.name.removeprefix('mjINT_').lower()!r}"
 
 
 def _flag(member: mujoco.mjtEnableBit):
@@ -95,38 +91,29 @@ def has_constraints(model: mujoco.MjModel) -> bool:
     )
 
 
-def describe_pair(model: mujoco.MjModel, pair) -> str:
-    """Return two geoms by name and type."""
-    kinds = (mujoco.mjtGeom(kind).name for kind in model.geom_type[[pair.geom1, pair.geom2]])
-    return " with ".join(
-        f"{name!r} ({kind.removeprefix('mjGEOM_').lower()})" for name, kind in zip(pair.names, kinds, strict=True)
-    )
+def _pairs(condition: Callable[[mujoco.MjModel, ContactPair, list[int]], object]):
+    """Return a function that names the pairs for which a condition on the pair and both types of geom holds."""
+
+    def find(model: mujoco.MjModel) -> Iterator[str]:
+        for pair in contact_pairs(model):
+            kinds = model.geom_type[[pair.geom1, pair.geom2]].tolist()
+            if condition(model, pair, kinds):
+                words = [mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in kinds]
+                yield " with ".join(f"{name!r} ({word})" for name, word in zip(pair.names, words, strict=True))
+
+    return find
 
 
-def _pairs_without_function(model: mujoco.MjModel) -> Iterator[str]:
-    for pair in contact_pairs(model):
-        if not has_collision_fn(*model.geom_type[[pair.geom1, pair.geom2]]):
-            yield describe_pair(model, pair)
-
-
-def _searched_pairs(model: mujoco.MjModel) -> Iterator[str]:
-    """Yield the pairs whose contact MJX can only find by a search on distance fields."""
-    smooth = {kind.value for kind in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, *_SEARCHED)}
-    searched = {kind.value for kind in _SEARCHED}
+def _is_searched(_: mujoco.MjModel, __: ContactPair, kinds: list[int]) -> bool:
+    """Return whether MJX can only find this contact by a search on distance fields."""
     known = {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CYLINDER.value}
-    for pair in contact_pairs(model):
-        kinds = set(model.geom_type[[pair.geom1, pair.geom2]].tolist())
-        if kinds & searched and kinds <= smooth and kinds != known:
-            yield describe_pair(model, pair)
+    return set(kinds) != known and bool(_SEARCHED.intersection(kinds)) and _SMOOTH.issuperset(kinds)
 
 
-def _margins_of_meshes(model: mujoco.MjModel) -> Iterator[str]:
-    without = {mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value}
-    for pair in contact_pairs(model):
-        geoms = [pair.geom1, pair.geom2]
-        margin = model.pair_margin[pair.explicit] if pair.explicit >= 0 else model.geom_margin[geoms].sum()
-        if margin and without & set(model.geom_type[geoms].tolist()):
-            yield describe_pair(model, pair)
+def _has_mesh_margin(model: mujoco.MjModel, pair: ContactPair, kinds: list[int]) -> bool:
+    margin = model.geom_margin[[pair.geom1, pair.geom2]].sum()
+    margin = model.pair_margin[pair.explicit] if pair.explicit >= 0 else margin
+    return bool(margin) and bool({_GEOM.mjGEOM_MESH.value, _GEOM.mjGEOM_HFIELD.value}.intersection(kinds))
 
 
 _LAWS = (
@@ -140,22 +127,23 @@ _LAWS = (
 )
 
 
-def _mixed_solrefs(model: mujoco.MjModel) -> Iterator[str]:
-    for name, kind in _LAWS:
-        field = name.format("ref")
-        for i, (first, second) in enumerate(getattr(model, field)):
-            if (first > 0) != (second > 0):
-                yield f"{first:g} {second:g} in {field} of {element_name(model, kind, i)}"
+def _laws(part: str, condition: Callable[[np.ndarray], np.ndarray]):
+    """Return a function that names the elements for whose `solref` or `solimp` a condition holds."""
+
+    def find(model: mujoco.MjModel) -> Iterator[str]:
+        for field, kind in ((name.format(part), kind) for name, kind in _LAWS):
+            rows = getattr(model, field)
+            for i in np.flatnonzero(condition(rows)).tolist():
+                numbers = " ".join(f"{x:g}" for x in rows[i, :3])
+                yield f"{numbers} in {field} of {element_name(model, kind, i)}"
+
+    return find
 
 
-def _without_width(model: mujoco.MjModel) -> Iterator[str]:
-    """Name impedances that vary over no width: C MuJoCo takes their mean at every depth, MJX the largest."""
-    for name, kind in _LAWS:
-        field = name.format("imp")
-        solimp = getattr(model, field)
-        ends = np.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
-        for i in np.flatnonzero((solimp[:, 2] <= mujoco.mjMINVAL) & (ends[:, 0] != ends[:, 1])).tolist():
-            yield f"{field} of {element_name(model, kind, i)}"
+def _varies_over_no_width(solimp: np.ndarray) -> np.ndarray:
+    """Return where C MuJoCo takes the mean impedance at every depth, MJX the largest."""
+    ends = np.clip(solimp[:, :2], mujoco.mjMINIMP, mujoco.mjMAXIMP)
+    return (solimp[:, 2] <= mujoco.mjMINVAL) & (ends[:, 0] != ends[:, 1])
 
 
 def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
@@ -167,19 +155,30 @@ def _disabled_actuators(model: mujoco.MjModel) -> np.ndarray:
 _DIRECTLY = "remove it from the MJCF"
 _LINEAR = "keep the linear coefficient only"
 
+# The part of an actuator, its field, the kinds that MJX knows, all kinds, and the remedy.
+ACTUATORS = (
+    ("transmission", "actuator_trntype", mjx.TrnType, mujoco.mjtTrn, "drive a joint, tendon or site instead"),
+    ("dynamics", "actuator_dyntype", mjx.DynType, mujoco.mjtDyn, "use none, integrator, filter, filterexact or muscle"),
+    ("gain", "actuator_gaintype", mjx.GainType, mujoco.mjtGain, "use fixed, affine or muscle"),
+    ("bias", "actuator_biastype", mjx.BiasType, mujoco.mjtBias, "use none, affine or muscle"),
+)
 # The missing feature; a function that names its uses in a model; the remedy.
 REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...] = (
     ("flexible bodies", _where(_OBJECT.mjOBJ_FLEX, lambda m: np.ones(m.nflex, bool)),
      "build them of rigid bodies and joints"),
     ("plugins", _where(_OBJECT.mjOBJ_PLUGIN, lambda m: np.ones(m.nplugin, bool)),
      "remove them, or replace signed distance fields by meshes or primitive geoms"),
-    ("collision between some types of geom", _pairs_without_function,
+    ("collision between some types of geom", _pairs(lambda _, __, kinds: not has_collision_fn(*kinds)),  # pyright: ignore[reportArgumentType]
      "exclude the pair by contype and conaffinity or <contact><exclude>, or use capsules, spheres or boxes"),
     # In dm_control's finger, with two ellipsoids, the derivative of a search is 2000 times the slope; elsewhere it is NaN.
     ("exact contact of cylinders and ellipsoids with each other and capsules, and of ellipsoids with spheres",
-     _searched_pairs, "use capsules, spheres or boxes, or exclude the pair by contype and conaffinity or <contact><exclude>"),
-    ("margin in contacts of meshes and height fields", _margins_of_meshes, "set margin='0' on both geoms"),
-    ("such integrator", _integrator, "use 'implicitfast', 'Euler' or 'RK4'"),
+     _pairs(_is_searched),
+     "use capsules, spheres or boxes, or exclude the pair by contype and conaffinity or <contact><exclude>"),
+    ("margin in contacts of meshes and height fields", _pairs(_has_mesh_margin), "set margin='0' on both geoms"),
+    ("such integrator",
+     _when(lambda m: m.opt.integrator in (_INTEGRATOR.mjINT_IMPLICIT, _INTEGRATOR.mjINT_DISCRETE),
+           lambda m: f"integrator={_INTEGRATOR(m.opt.integrator).name.removeprefix('mjINT_').lower()!r}"),
+     "use 'implicitfast', 'Euler' or 'RK4'"),
     ("override of contact parameters", _flag(_ENABLE.mjENBL_OVERRIDE),
      "write o_solref, o_solimp, o_friction and half of o_margin into <default><geom>"),
     ("exact constraint diagonal", _flag(_ENABLE.mjENBL_DIAGEXACT), _DIRECTLY),
@@ -193,7 +192,10 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
     ("polynomial tendon stiffness or damping",
      _where(_OBJECT.mjOBJ_TENDON, lambda m: np.hstack([m.tendon_stiffnesspoly, m.tendon_dampingpoly]) != 0),
      "keep the linear coefficients only"),
-    ("polynomial actuator damping", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_dampingpoly != 0), _LINEAR),
+    ("armature or damping of an actuator",
+     _where(_OBJECT.mjOBJ_ACTUATOR,
+            lambda m: np.column_stack([m.actuator_armature, m.actuator_damping, m.actuator_dampingpoly]) != 0),
+     "give them, times gear², to its joint or tendon, with linear coefficients only"),
     ("surface velocity", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_surfacevel != 0),
      "drive the body that carries the geom by a joint"),
     ("contact adhesion", _where(_OBJECT.mjOBJ_GEOM, lambda m: m.geom_adhesion != 0), _DIRECTLY),
@@ -201,21 +203,11 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
     ("ellipsoid fluid model", _where(_OBJECT.mjOBJ_GEOM, lambda m: (m.geom_fluid[:, 0] > 0) & has_medium(m)),
      "use fluidshape='none' for the box model, or set density and viscosity to zero"),
     ("fluid forces with integrator 'implicitfast'",
-     _when(lambda m: has_medium(m) and m.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+     _when(lambda m: has_medium(m) and m.opt.integrator == _INTEGRATOR.mjINT_IMPLICITFAST,
            lambda m: f"density={m.opt.density:g}, viscosity={m.opt.viscosity:g}"),
      "use 'Euler' or 'RK4'"),
-    ("such actuator transmission",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_trntype", mjx.TrnType, mujoco.mjtTrn, "mjTRN_"),
-     "drive a joint, tendon or site instead"),
-    ("such actuator dynamics",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_dyntype", mjx.DynType, mujoco.mjtDyn, "mjDYN_"),
-     "use none, integrator, filter, filterexact or muscle"),
-    ("such actuator gain",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_gaintype", mjx.GainType, mujoco.mjtGain, "mjGAIN_"),
-     "use fixed, affine or muscle"),
-    ("such actuator bias",
-     _unknown_type(_OBJECT.mjOBJ_ACTUATOR, "actuator_biastype", mjx.BiasType, mujoco.mjtBias, "mjBIAS_"),
-     "use none, affine or muscle"),
+    *((f"such actuator {word}", _unknown_type(_OBJECT.mjOBJ_ACTUATOR, field, ours, theirs), remedy)
+      for word, field, ours, theirs, remedy in ACTUATORS),
     ("actuators with several controls", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_ctrlnum != 1),
      "use one actuator per control"),
     ("disabled actuator groups", _where(_OBJECT.mjOBJ_ACTUATOR, _disabled_actuators),
@@ -225,14 +217,13 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
     ("actuator delay", _where(_OBJECT.mjOBJ_ACTUATOR, lambda m: m.actuator_history[:, 0] > 0),
      "remove delay and nsample, and delay the controls before the rollout"),
     ("such equality constraint",
-     _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq, "mjEQ_"),
-     "use connect, weld, joint or tendon"),
+     _unknown_type(_OBJECT.mjOBJ_EQUALITY, "eq_type", mjx.EqType, mujoco.mjtEq), "use connect, weld, joint or tendon"),
     ("flags that disable only springs or only dampers",
      _when(lambda m: bool(m.opt.disableflags & _DISABLE.mjDSBL_SPRING) != bool(m.opt.disableflags & _DISABLE.mjDSBL_DAMPER),
            "one of <flag spring='disable'/> and <flag damper='disable'/>"),
      "set stiffness or damping to zero instead"),
-    ("impedance that rises over no width", _without_width, "give solimp a width, or equal d0 and dwidth"),
-    ("solref of mixed signs", _mixed_solrefs,
+    ("impedance that rises over no width", _laws("imp", _varies_over_no_width), "give solimp a width, or equal d0 and dwidth"),
+    ("solref of mixed signs", _laws("ref", lambda solref: (solref[:, 0] > 0) != (solref[:, 1] > 0)),
      "give two positive numbers (time constant, damping ratio) or two that are not (−stiffness, −damping)"),
     ("joint limit that acts on both ends at once",
      _where(_OBJECT.mjOBJ_JOINT,

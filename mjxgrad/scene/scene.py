@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
-from mjxgrad._text import format_number, name_pairs
+from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
@@ -70,15 +70,6 @@ class Scene(eqx.Module):
         """The default engine: "mjx", or "mujoco" where MJX lacks something."""
         return "mujoco" if self.unsupported else "mjx"
 
-    def check_mjx(self) -> None:
-        """Refuse a scene that MJX cannot step.
-
-        Raises:
-            SceneError: with the features that MJX lacks.
-        """
-        if self.unsupported:
-            raise SceneError(self.unsupported)
-
     def contact_parameters(self) -> ContactParameters:
         """Return the effective parameters of the pairs that can touch, one row each; traceable."""
         return contact_parameters(self.model, self.pairs)
@@ -123,15 +114,14 @@ class Scene(eqx.Module):
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
-        for name, value in changed.items():
-            if is_known(value) and np.isnan(value).any():
+        # Not jnp, which jit would trace.
+        known = {name: np.asarray(value).min(initial=np.inf) for name, value in changed.items() if is_known(value)}
+        for name, least in known.items():
+            if np.isnan(least):
                 raise ValueError(f"{name} must hold numbers, got NaN")
-            if is_known(value) and (
-                (name in _NOT_NEGATIVE and (np.asarray(value) < 0).any())
-                or (name == "timestep" and not np.asarray(value).all())
-            ):
+            if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
-                raise ValueError(f"{name} must {requirement}, got {np.asarray(value).min():g}")
+                raise ValueError(f"{name} must {requirement}, got {least:g}")
         if "wind" in fields and not has_medium(self.mj_model):
             _warn(self, "wind acts on nothing without a medium: set density or viscosity in <option>")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
@@ -321,7 +311,7 @@ def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
     yield "k", "1/s²", _numbers(parameters.stiffness)
     yield "b", "1/s", _numbers(parameters.damping)
     yield "ζ", "", _numbers(parameters.damping_ratio)
-    yield "impedance", "", [_range(row) for row in np.asarray(parameters.impedance)]
+    yield "impedance", "", [format_range(row) for row in np.asarray(parameters.impedance)]
     yield "width", "mm", _numbers(1e3 * parameters.width)
     yield "h²k+2hb", "", _numbers(parameters.stability)
     frictions = np.asarray(parameters.friction).tolist()
@@ -340,26 +330,14 @@ def _friction(condim: int, friction: Sequence[float]) -> str:
     return " ".join(cells) or "none"
 
 
-def _range(pair: np.ndarray) -> str:
-    low, high = (f"{x:.4g}" for x in pair)
-    return low if low == high else f"{low}–{high}"
-
-
 def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = False) -> str:
     """Return a title and aligned columns, the first left-aligned; nothing without rows."""
     if not rows:
         return ""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    align = str.rjust if is_numeric else str.ljust
-    lines = []
-    for first, *others in rows:
-        cells = [align(cell, width) for cell, width in zip(others, widths[1:], strict=True)]
-        line = "  " + "  ".join([first.ljust(widths[0]), *cells]).rstrip()
-        if not is_numeric and len(line) > _WIDTH:
-            # Only sentences wrap: a broken row of numbers is unreadable.
-            line = textwrap.fill(line.strip(), _WIDTH, initial_indent="  ", subsequent_indent="      ")
-        lines.append(line)
-    return "\n".join([title, *lines])
+    # Only sentences wrap: a broken row of numbers is unreadable.
+    width, align = (10**6, str.rjust) if is_numeric else (_WIDTH, str.ljust)
+    wrap = textwrap.TextWrapper(width, initial_indent="  ", subsequent_indent="      ").fill
+    return "\n".join([title, *map(wrap, aligned(rows, align))])
 
 
 def _bullets(title: str, sentences: Sequence[str]) -> str:

@@ -62,7 +62,7 @@ def test_the_reference_is_the_gradient_of_the_smoothed_cost(ramps):
 
 
 def test_a_continuous_cost_shows_no_bias(ramps):
-    low, high = ramps.bias_interval
+    low, high = ramps.interval("bias")
     covers = (low < 0) & (high > 0)
     # Nine intervals of 95 %, three of the same noise: one that misses is no surprise, three are.
     assert covers.sum() >= 7
@@ -74,7 +74,7 @@ def test_the_variance_of_a_steep_ramp_lies_in_its_interval(ramps):
         p = textbook.ramp_probability(point, width)
         return (2 / width) ** 2 * p * (1 - p)
 
-    low, high = ramps.first_variance_interval
+    low, high = ramps.variance_intervals["first"]
     exact = exact_ramp(variance)
     assert ((low < exact) & (exact < high)).sum() >= 7
     np.testing.assert_array_less((high - low) / exact, 0.6)
@@ -92,7 +92,7 @@ def test_the_intervals_of_the_zeroth_order_variance_hold_it(ramps):
         terms = (costs - weights @ costs) * noise / STDDEV**2
         return weights @ terms**2 - (weights @ terms) ** 2
 
-    low, high = ramps.zeroth_variance_interval
+    low, high = ramps.variance_intervals["zeroth"]
     exact = exact_ramp(variance)
     assert ((low < exact) & (exact < high)).sum() >= 7
     np.testing.assert_array_less((high - low) / exact, 0.6)
@@ -102,7 +102,7 @@ def test_the_bias_of_first_order_is_the_jump_that_it_misses(jumps):
     exact = -np.asarray(HEIGHTS)[:, None] * norm.pdf(np.asarray(POINTS)[:, 0] / STDDEV) / STDDEV
     table, _, _ = jumps
     np.testing.assert_array_less(np.abs(table.bias[..., 0] - exact), 4 * table.bias_error[..., 0])
-    low, high = table.bias_interval[..., 0]
+    low, high = table.interval("bias")[..., 0]
     assert (high[1:] < 0).all()
     assert ((low[0] < 0) & (high[0] > 0)).sum() >= 2
 

@@ -90,14 +90,6 @@ def test_an_interval_within_one_tooth_is_not_resolved():
     assert not bool(found.is_resolved())
 
 
-def test_a_torn_outcome_is_irregular_and_a_curved_one_is_not():
-    """A slope that turns from one quarter to the next is none; that of a parabola changes along a straight line."""
-    torn = compare(lambda x: np.sin(60 * x) / 10, [lambda x: 6 * np.cos(60 * x)])
-    curved = compare(lambda x: 5 * (x - 0.3) ** 2, [lambda x: 10 * (x - 0.3)])
-    assert float(torn.irregularity) > 0.5
-    assert float(curved.irregularity) < 0.05
-
-
 def test_phases_that_are_not_finite_are_left_out_and_counted():
     x = phases(INTERVAL, 64)
     gaps = np.where(np.arange(64) % 16 == 5, np.nan, 1.0)

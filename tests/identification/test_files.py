@@ -108,12 +108,12 @@ def test_the_written_scene_has_the_numbers_that_were_found(scene, tmp_path):
         np.testing.assert_allclose(getattr(again, field), getattr(expected, field), rtol=1e-4, atol=1e-6, err_msg=field)
 
 
-def test_held_out_is_the_end_of_one_motion_or_some_of_several(scene):
+def test_held_out_is_the_end_of_one_motion_or_some_of_several():
     one = files.Recording({"place": np.arange(10.0)}, np.zeros((10, 2)), 0.01 * np.arange(10), 0.01 * np.arange(10))
-    (early,), (late,) = files.hold_out(scene, [one], 0.3)
+    (early,), (late,) = files.hold_out([one], 0.3)
     assert len(early.times) == 7
     np.testing.assert_array_equal(np.isfinite(late.measured["place"][:, 0]), np.arange(10) > 6)
-    fitted, judged = files.hold_out(scene, [one] * 10, 0.2)
+    fitted, judged = files.hold_out([one] * 10, 0.2)
     assert (len(fitted), len(judged)) == (8, 2)
 
 

@@ -74,6 +74,8 @@ REFUSED = {
         _fill(PENDULUM, rest=FIXED_TENDON.format("damping='1 2 3'")), "tendon 't'", "linear"),
     "actuator damping polynomial": (
         _fill(PENDULUM, rest=_actuator("damping='0.3 0.2 0.1'")), "actuator 'a'", "linear"),
+    "actuator armature": (_fill(PENDULUM, rest=_actuator("gear='2' armature='0.5'")), "actuator 'a'", "gear²"),
+    "actuator damping": (_fill(PENDULUM, rest=_actuator("gear='2' damping='0.3'")), "actuator 'a'", "gear²"),
     "surface velocity": (_fill(BALL, geom="surfacevel='1 0 0 0 0 0'"), "geom 'g'", "joint"),
     "adhesion of a geom": (_fill(BALL, geom="adhesion='5'"), "geom 'g'", "remove"),
     "adhesion of a pair": (
