@@ -291,7 +291,7 @@ def bias_variance(
         objective_of_softness: function from one softness to the objective; traceable.
         params: points to measure at, one per row, in the parameters' units.
         key: consumed here.
-        softness: any pytree whose leaves have a leading axis (`Softness.sweep`).
+        softness: any pytree whose leaves have a leading axis, such as a `Softness` of arrays.
         num_samples: differentiated rollouts per softness and point. At least 2.
         num_reference: rollouts for the reference. They count per softness for a single parameter with noise (one landscape
             serves all points), otherwise per softness and point. At least 4.
@@ -504,7 +504,5 @@ def _stacked(softness: PyTree) -> tuple[PyTree, int]:
     softness = jax.tree.map(jnp.asarray, softness)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
     if len(lengths) != 1 or () in lengths or (0,) in lengths:
-        raise ValueError(
-            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; see Softness.sweep"
-        )
+        raise ValueError(f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}")
     return softness, lengths.pop()[0]
