@@ -9,7 +9,7 @@ Matrix products request full precision: NVIDIA GPUs otherwise round factors to t
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import jax
@@ -77,7 +77,8 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
         kind = model.opt.integrator
         raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
     has_stages = model.opt.integrator == _Integrator.mjINT_RK4
-    evaluate, finish = (_stages, _after_stages) if has_stages else (_forward, _after_one)
+    ways: tuple[Callable, Callable] = (_stages, _after_stages) if has_stages else (_forward, _after_one)
+    evaluate, finish = ways
     with _at_full_precision(model, data):
         if not isinstance(contact, Slope):
             return finish(model, data, evaluate(model, data, contact))
@@ -292,7 +293,7 @@ def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: 
 
 def _stages(
     model: mjx.Model, start: mjx.Data, contact: Contact, after: _Vector | None = None
-) -> tuple[tuple[Array, Array, Array], mjx.Data]:
+) -> tuple[tuple[Array, ...], mjx.Data]:
     """Return the mean rates of position, velocity and activations by the classical fourth-order rule, and its four stages.
 
     All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
@@ -321,7 +322,7 @@ def _stages(
     return means, stages
 
 
-def _after_stages(model: mjx.Model, start: mjx.Data, found: tuple[tuple[Array, Array, Array], mjx.Data]) -> mjx.Data:
+def _after_stages(model: mjx.Model, start: mjx.Data, found: tuple[tuple[Array, ...], mjx.Data]) -> mjx.Data:
     """Return data one step later, from the result of `_stages`."""
     (velocity, acceleration, act_dot), stages = found
     last = jax.tree.map(lambda x: x[-1], stages).replace(
