@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -56,7 +56,6 @@ class Settings(RunSettings):
     """Of the noise by which zeroth order and α-order search, white in time (10 N)."""
     search_samples: Annotated[int, Field(ge=4)] = 16
     """Rollouts per step of these."""
-    kernel: Literal["gaussian", "logistic", "log_barrier"] = "gaussian"
     """Of the smoothing."""
     solved_below: Positive = 0.1
     """True cost that counts as solved; the untouched bed has 1."""
@@ -210,7 +209,7 @@ def _seen(task: RollingPin, variant: Variant, scale: Array, mode: str | None, se
     # Without a margin this is the contact of the scene.
     rest = settings.remedies.rest_acceleration
     task = task.with_softness(mg.Softness(STIFFNESS, 1.0, margin=scale * variant["margin"], rest_acceleration=rest))
-    return task if mode is None else task.with_contact(Smoothing(scale * variant["length"], settings.kernel, mode))
+    return task if mode is None else task.with_contact(Smoothing(scale * variant["length"], mode))
 
 
 def answer(outcome: Outcome) -> str:

@@ -145,7 +145,7 @@ def _own(settings: Settings, workspace: Workspace) -> _Problem:
         raise ExperimentError(f"no two geoms of {settings.scene} can touch, so there is no stiffness to sweep")
     knob = Knob(task, settings.stddev, settings.seed)
     stiffness = np.array([*sorted(settings.stiffness), *[knob.own] * settings.include_default])
-    return stiffness, mg.Softness.sweep(stiffness=stiffness), knob
+    return stiffness, mg.Softness(stiffness=stiffness), knob
 
 
 def _ramp(settings: Settings) -> _Problem:

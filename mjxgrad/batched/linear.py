@@ -73,41 +73,37 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
     return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
 
 
-def batch_last(function: Callable) -> Callable:
+def batch_last(function: Callable, batch: int | None = None) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
     Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank.
+
+    Args:
+        function: takes and returns pytrees of arrays. The arguments must not contain None: the forward mode of `custom_vmap`,
+            which `jax.hessian` uses, takes it for an array (jax 0.10.2).
+        batch: the size of a trailing axis that the arrays have already; None without one.
     """
-
-    def flat(*args: PyTree) -> PyTree:
-        # Leaves, not pytrees: the forward mode of `custom_vmap`, which `jax.hessian` uses, takes a None among its arguments
-        # for an array (jax 0.10.2).
-        leaves, structure = jax.tree.flatten(args)
-        return _batch_last(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), None)(*leaves)
-
-    return flat
-
-
-def _batch_last(function: Callable, batch: int | None) -> Callable:
-    """Return `batch_last` of a function of arrays; `batch` is the size of their trailing axis, None without one."""
     # Under `jax.jit` constants stay inside. `custom_vmap` refuses to batch constants, which `jax.lax.cond` requires
     # where its condition differs between members of the batch.
     batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
     @batched.def_vmap
-    def rule(size, is_batched, *leaves):
-        if not any(is_batched):  # in forward mode, where only the tangents are batched
-            result = function(*leaves)
+    def rule(size, is_batched, *args):
+        has_batch = jax.tree.leaves(is_batched)
+        if not any(has_batch):  # in forward mode, where only the tangents are batched
+            result = function(*args)
             return result, jax.tree.map(lambda _: False, result)
 
         def back(x: Array) -> Array:
             split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
             return jnp.moveaxis(split, -1, 0)
 
-        moved = _moved_last(list(leaves), list(is_batched), size)
+        leaves, structure = jax.tree.flatten(args)
+        moved = _moved_last(leaves, has_batch, size)
         if batch is not None:
             moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
-        result = _batch_last(function, size if batch is None else batch * size)(*moved)
+        merged = batch_last(function, size if batch is None else batch * size)
+        result = merged(*jax.tree.unflatten(structure, moved))
         return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
     return batched

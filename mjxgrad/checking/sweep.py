@@ -281,7 +281,7 @@ def sweep(
         knob,
         jnp.zeros((1, 1)),
         jax.random.key(seed),
-        softness=Softness.sweep(stiffness=swept),
+        softness=Softness(stiffness=swept),
         num_samples=num_samples,
         num_reference=num_reference,
         compiler_options=compiler_options(),

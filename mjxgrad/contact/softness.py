@@ -60,7 +60,7 @@ class Softness(eqx.Module):
 
     A part that is `None` stays as it is in the model. If only one of stiffness and damping ratio is given, the other keeps its
     present effective value. Every part is a leaf of a pytree, so that a sweep is one `jax.vmap` over a `Softness` with a
-    leading axis (see `sweep`).
+    leading axis.
 
     Attributes:
         stiffness: $k = \omega_0^2$, in 1/s²; positive. With `rest_acceleration` it is the stiffness without margin.
@@ -95,29 +95,6 @@ class Softness(eqx.Module):
             value = getattr(self, name)
             if is_known(value) and not np.all(is_valid(np.asarray(value))):
                 raise ValueError(f"{name} must be {requirement}, got {np.asarray(value).tolist()}")
-
-    @classmethod
-    def sweep(cls, **parts: Any) -> "Softness":
-        """Stack several values of softness for `jax.vmap`; parts with a single value are broadcast.
-
-        `Softness.sweep(stiffness=[1e2, 1e4], damping_ratio=1.0)` has two values of each.
-
-        Args:
-            **parts: the arguments of `Softness`, each with or without a leading axis; an impedance $(d_0, d_w)$ has its pair
-                on the last axis.
-
-        Returns:
-            One `Softness` whose leaves share their leading axis.
-        """
-        static = {name: parts.pop(name) for name in ("geoms", "pairs") if name in parts}
-        arrays = {name: as_float(value) for name, value in parts.items() if value is not None}
-        lengths = {name: a.shape[0] for name, a in arrays.items() if a.ndim}
-        length = max(lengths.values(), default=1)
-        for name, a in arrays.items():
-            is_pair = name == "impedance" and a.shape == (2,) and length != 2
-            if a.ndim == 0 or is_pair:
-                arrays[name] = jnp.broadcast_to(a, (length, *a.shape))
-        return cls(**arrays, **static)
 
     def selected(self, model: mjx.Model) -> tuple[ContactPair, ...]:
         """Return the pairs that this softness changes; all pairs without a subset.

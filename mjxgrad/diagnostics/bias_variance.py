@@ -290,7 +290,7 @@ def bias_variance(
         objective_of_softness: function from one softness to the objective; traceable.
         params: points to measure at, one per row, in the parameters' units.
         key: consumed here.
-        softness: any pytree whose leaves have a leading axis (`Softness.sweep`).
+        softness: any pytree whose leaves have a leading axis, such as a `Softness` of arrays.
         num_samples: differentiated rollouts per softness and point. At least 2.
         num_reference: rollouts for the reference. They count per softness for a single parameter with noise (one landscape
             serves all points), otherwise per softness and point. At least 4.

@@ -21,7 +21,6 @@ import mujoco
 import numpy as np
 
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
-from mjxgrad.contact.bounce import Bounce
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
@@ -125,24 +124,35 @@ class Spring:
         """Number of time steps in a single bounce, at any speed; infinite without stiffness."""
         if self.stiffness <= 0 or self.damping <= 0:
             return np.pi / np.sqrt(self.stiffness) / self.timestep if self.stiffness > 0 else np.inf
-        return float(self._bounce.duration) / self.timestep
+        return 2 * bounce_angle(self.damping_ratio) / np.sqrt(self.stiffness) / self.timestep
 
     def depth(self, speed: float) -> float:
         r"""Return the depth in m of a bounce at a speed of approach, $v \sqrt e / \omega_0$, restitution $e$."""
         if self.stiffness <= 0:
             return np.inf
-        restitution = 1.0 if self.damping <= 0 else float(self._bounce.restitution)
-        return speed * np.sqrt(restitution / self.stiffness)
+        ratio = self.damping_ratio if self.damping > 0 else 0.0
+        return speed * np.sqrt(restitution(ratio) / self.stiffness)
 
     def rise_steps(self, speed: float) -> float:
         """Return the number of steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
         first, last = self.impedance
         return self.width / (speed * self.timestep) if first != last and speed > 0 else np.inf
 
-    @property
-    def _bounce(self) -> Bounce:
-        # Bounce writes ω₀ = 1 / (t_c ζ), which is √k by the definitions above.
-        return Bounce(self.time_constant, self.damping_ratio)
+
+def bounce_angle(damping_ratio: float) -> float:
+    r"""Return $\arccos\zeta / \sqrt{1 - \zeta^2}$, half the duration of a bounce in units of $1 / \omega_0$.
+
+    It holds under a constant impedance and without gravity: the force acts from $r = 0$ until $\ddot r = 0$.
+    """
+    if damping_ratio == 1:
+        return 1.0
+    angle = math.acos(damping_ratio) if damping_ratio < 1 else math.acosh(damping_ratio)
+    return angle / math.sqrt(abs((1 - damping_ratio) * (1 + damping_ratio)))
+
+
+def restitution(damping_ratio: float) -> float:
+    r"""Return the share of its speed that a ball keeps in such a bounce; $e^{-2}$ at critical damping."""
+    return math.exp(-2 * damping_ratio * bounce_angle(damping_ratio))
 
 
 @dataclass(frozen=True)

@@ -192,8 +192,7 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
 
     Args:
         scene: the scene with the nominal value.
-        part: "stiffness" (1/s²), "damping_ratio", which determines the restitution (`mjxgrad.contact.bounce`), or "width"
-            (m).
+        part: "stiffness" (1/s²), "damping_ratio", which determines the restitution, or "width" (m).
         bounds: least and greatest value; a tenth and ten times the nominal value by default.
         **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
 

@@ -179,21 +179,21 @@ def value_and_gradient(
     This is forward mode up to three dimensions, and reverse mode above or for functions without forward mode
     (`jax.custom_vjp`).
     """
-
-    def scalar(at: Float[Array, " dim"]) -> Any:
-        found = function(at)
-        return (as_scalar(found[0], "function"), *found[1:]) if has_aux else as_scalar(found, "function")
-
     if point.size <= MOST_FORWARD_DIMENSIONS:
-        along = functools.partial(jax.jvp, scalar, (point,), has_aux=has_aux)
+        along = functools.partial(jax.jvp, function, (point,), has_aux=has_aux)
         out_axes = (None, 0, None) if has_aux else (None, 0)
         try:
             value, gradient, *besides = jax.vmap(along, out_axes=out_axes)((jnp.eye(point.size, dtype=point.dtype),))
-            return (value, *besides) if has_aux else value, gradient
         except TypeError:  # jax.custom_vjp has no forward mode; any other TypeError is raised again below
             pass
-    value, pull_back, *besides = jax.vjp(scalar, point, has_aux=has_aux)
-    (gradient,) = pull_back(jnp.ones_like(value))
+        else:
+            value = as_scalar(value, "function")
+            if gradient.dtype == jax.dtypes.float0:  # the tangent of an integer
+                gradient = jnp.zeros_like(point)
+            return (value, *besides) if has_aux else value, gradient
+    found, pull_back, *besides = jax.vjp(function, point, has_aux=has_aux)
+    value = as_scalar(found, "function")
+    (gradient,) = pull_back(jnp.ones_like(found))
     return (value, *besides) if has_aux else value, gradient
 
 

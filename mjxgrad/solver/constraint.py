@@ -17,7 +17,7 @@ are the sum of two such terms,
     ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)):
 
 at the top both vanish, in the middle the second does, at the bottom they add up to ½ Σ D x². Noise shifts N by μcw, so
-each term is the simple one with a spread of its own. This is exact for every kernel, and convex. At T = 0 the tangential
+each term is the simple one with a spread of its own. This is exact, and convex. At T = 0 the tangential
 forces of the two terms cancel.
 
 Arrays may carry the batch as trailing axes, see `linear`.
@@ -34,7 +34,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad.batched.linear import add, sum_of_few
-from mjxgrad.solver.kernels import Kernel
+from mjxgrad.solver.noise import ramp, share
 
 _PerRow = Float[Array, "rows *batch"]
 _PerContact = Float[Array, "contacts *batch"]
@@ -63,8 +63,7 @@ class RowLayout:
     num_friction: int
     num_rows: int
     cones: tuple[ConeGroup, ...] = ()
-    kernel: Kernel | None = None
-    first_noisy: int = 0
+    first_noisy: int | None = None
 
     @property
     def friction(self) -> slice:
@@ -78,19 +77,19 @@ class RowLayout:
     @property
     def is_piecewise_quadratic(self) -> bool:
         """Whether the cost along a line is piecewise quadratic."""
-        return not self.cones and self.kernel is None
+        return not self.cones and self.first_noisy is None
 
     @property
     def hard_stop(self) -> int:
         """End of the uncoupled rows without noise; all later rows have noise, cones included."""
-        return self.simple_stop if self.kernel is None else self.first_noisy
+        return self.simple_stop if self.first_noisy is None else self.first_noisy
 
 
 class Noise(eqx.Module):
     """The effect of noise on the distance r on x of the rows of contacts; a cone uses its first row.
 
     Attributes:
-        spread: change of x when r changes by one length of the kernel (m/s² or rad/s²); positive.
+        spread: change of x when r changes by one length of the noise (m/s² or rad/s²); positive.
         gate: x at which contact ends by distance and not by acceleration (m/s² or rad/s²).
     """
 
@@ -106,7 +105,7 @@ class Rows(eqx.Module):
         weight: D, the inverse of the regularisation R (kg or kg m²).
         bound: largest force of a friction loss row (N or N m); unused by other rows.
         scales: (μ, f₁, ..., f_dim-1) of each contact, one array per elliptic group; μ = f₁/√impratio.
-        noise: noise on the rows, if the layout has a kernel.
+        noise: noise on the rows, if the layout has noisy rows.
     """
 
     reference: _PerRow
@@ -128,9 +127,9 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
         jnp.where(jnp.abs(linear[friction]) < bound, linear[friction], -limit),
         jnp.where(x[hard] < 0, linear[hard], 0.0),
     ]
-    if layout.kernel is not None:
+    if layout.first_noisy is not None:
         noisy = slice(layout.hard_stop, layout.simple_stop)
-        parts.append(rows.weight[noisy] * _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
+        parts.append(rows.weight[noisy] * _mean_violation(x[noisy], _noise_at(rows, noisy))[0])
     for k in range(len(layout.cones)):
         parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
@@ -188,11 +187,11 @@ def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array,
     equality = jnp.ones_like(x[: friction.start], bool)
     is_curved = jnp.concatenate([equality, stuck, x[hard] < 0])
     curvature = jnp.where(is_curved, rows.weight[: layout.hard_stop], 0.0)
-    if layout.kernel is None:
+    if layout.first_noisy is None:
         return curvature
     noisy = slice(layout.hard_stop, layout.simple_stop)
-    share = _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
-    return jnp.concatenate([curvature, rows.weight[noisy] * share])
+    probability = _mean_violation(x[noisy], _noise_at(rows, noisy))[1]
+    return jnp.concatenate([curvature, rows.weight[noisy] * probability])
 
 
 class _Cone(eqx.Module):
@@ -267,7 +266,7 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
     mu, normal = scale[:, 0], u[:, 0]
     stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))
-    if layout.kernel is None:
+    if layout.first_noisy is None:
         is_top = normal >= mu * slip
         is_bottom = ~is_top & (mu * normal + slip <= 0)
         tangent = u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
@@ -276,11 +275,11 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
     first = Noise(mu * noise.spread, mu * noise.gate)
     second = Noise(mu * first.spread, mu * first.gate)
-    violation1, share1 = _mean_violation(layout.kernel, normal - mu * slip, first)
-    violation2, share2 = _mean_violation(layout.kernel, mu * normal + slip, second)
+    violation1, share1 = _mean_violation(normal - mu * slip, first)
+    violation2, share2 = _mean_violation(mu * normal + slip, second)
     # The tangential force per slip. At small slip the two terms nearly cancel. There the mean of the derivative over the
     # slip is taken instead, by the trapezoidal rule: its second-order error equals rounding at the cube root of eps.
-    still = _mean_violation(layout.kernel, normal, first)[1]
+    still = _mean_violation(normal, first)[1]
     smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
     is_small = slip < smallest
     moving = (mu * violation1 - violation2) / jnp.where(is_small, 1.0, slip)
@@ -299,7 +298,7 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
 
 
 def _mean_violation(
-    kernel: Kernel, x: Float[Array, "n *batch"], noise: Noise
+    x: Float[Array, "n *batch"], noise: Noise
 ) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
     """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.
 
@@ -308,5 +307,5 @@ def _mean_violation(
     """
     held = jnp.where(x > noise.gate, x, noise.gate)
     near = held / noise.spread
-    share = kernel.share(near)
-    return noise.spread * kernel.ramp(near) + share * (held - x), share
+    probability = share(near)
+    return noise.spread * ramp(near) + probability * (held - x), probability

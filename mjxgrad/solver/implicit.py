@@ -77,7 +77,7 @@ def solve_both(
         none = jnp.zeros(differ.shape, jnp.int32)
         return linear.solve_subset(minimise, differ, (start, none), system, start, tolerance)
 
-    if not _solves_subset():
+    if not device.is_cpu():  # a GPU solves all of them sooner than those that need it
         both, counts = jax.vmap(lambda v: linear.batch_last(minimise)(system.with_variant(v), start, tolerance))(
             variants
         )
@@ -102,18 +102,13 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
         return solve_linearised(layout, varied, row_hessian, force, is_needed)
 
     _, change = jax.jvp(residual, (system, variants), (tangents[0], tangents[1]))
-    if _solves_subset():
+    if device.is_cpu():
         moved = [response(variants[k], both[k], change[k], needed) for k, needed in enumerate((None, differ))]
         moved = -jnp.stack(moved)
     else:
         moved = -jax.vmap(response)(variants, both, change)
     no_change = np.zeros(count.shape, jax.dtypes.float0)
     return (both, count), (moved, no_change)
-
-
-def _solves_subset() -> bool:
-    """Return whether to solve only for the members of a batch that need it: a GPU solves all of them sooner."""
-    return device.is_cpu()
 
 
 def solve_linearised(

@@ -9,7 +9,7 @@ would act wherever $J a - a_\text{ref} + K d w < 0$, touching or not, as in inte
 would brake approaching bodies from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact.
 
 A row has x = J a + B J v + c r with c = K d(r), and the force -D x where x < 0 and r < 0. Noise w on r turns these into
-x + c w and r + w. With ρ the noise's density and S its softened ramp, in units of its length (see `kernels`), the mean
+x + c w and r + w. With ρ the noise's density and S its softened ramp, in units of its length (see `solver.noise`), the mean
 force is
 
     F(x) = -D ∫_{w < W} (x + c w) ρ(w) dw,        W = min(-r, -x/c).
@@ -44,8 +44,8 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.collision import CONVEX, are, is_blind
 from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.solver import noise as normal
 from mjxgrad.solver.constraint import Noise, RowLayout
-from mjxgrad.solver.kernels import KERNELS, Kernel
 from mjxgrad.stepping.rows import Block, per_row
 
 Mode = Literal["forward", "backward"]
@@ -57,37 +57,27 @@ _WEIGHTLESS = 1e30
 
 
 class Smoothing(eqx.Module):
-    """Noise on the distance of every contact, averaged in the solver without sampling.
+    """Gaussian noise on the distance of every contact, averaged in the solver without sampling.
 
     A pytree whose lengths are leaves: a sweep over them is one `jax.vmap`, and the step can be differentiated by them.
 
     Attributes:
-        length: length of the noise (m): the standard deviation of the Gaussian; other kernels have the same mean absolute
-            value.
-        kernel: "gaussian", "logistic" or "log_barrier"; see `kernels`. The first two reach a few lengths, the last one falls
-            off as 1/r.
+        length: standard deviation of the noise (m); contacts act from a few lengths away.
         mode: "forward" simulates the smoothed contact, with force at a distance and its derivatives. "backward" simulates
             without smoothing, and takes the derivative of the smoothed step at each visited state.
     """
 
     length: Float[Array, "..."] = eqx.field(converter=as_float)
-    # Plain strings, so that unknown names reach the check below, which lists the choices.
-    kernel: str = eqx.field(static=True, default="gaussian")
+    # A plain string, so that unknown names reach the check below, which lists the choices.
     mode: str = eqx.field(static=True, default="forward")
 
     def __check_init__(self):
-        """Refuse unknown names, and a known length that is not positive and finite."""
-        for name, choices in (("kernel", tuple(KERNELS)), ("mode", get_args(Mode))):
-            if (given := getattr(self, name)) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
+        """Refuse an unknown mode, and a known length that is not positive and finite."""
+        if self.mode not in get_args(Mode):
+            raise ValueError(f"mode must be one of {', '.join(map(repr, get_args(Mode)))}, got {self.mode!r}")
         if is_known(self.length) and not np.all((np.asarray(self.length) > 0) & np.isfinite(self.length)):
             remedy = "for MuJoCo's own motion take mg.Discrete()"
             raise ValueError(f"length must be positive and finite, got {np.asarray(self.length)!s}: {remedy}")
-
-    @property
-    def noise(self) -> Kernel:
-        """Return the kernel, in units of the length."""
-        return KERNELS[self.kernel]
 
 
 def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
@@ -95,7 +85,7 @@ def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
     messages = []
     pairs = contact_pairs(model)
     if not pairs:
-        messages.append(f"smoothing of {smoothing.kernel} contact has no effect: no two geoms of the scene can touch")
+        messages.append("smoothing has no effect: no two geoms of the scene can touch")
     geoms = np.array([(pair.geom1, pair.geom2) for pair in pairs], int).reshape(-1, 2)
     blind = [str(pairs[i]) for i in np.flatnonzero(is_blind(model, geoms))]
     if blind:
@@ -135,15 +125,15 @@ def smoothed(
     if first is None:
         return blocks, None, layout
     noise = Noise(*(jnp.concatenate([getattr(n, name) for n in noises]) for name in ("spread", "gate")))
-    return rows, noise, dataclasses.replace(layout, kernel=smoothing.noise, first_noisy=first)
+    return rows, noise, dataclasses.replace(layout, first_noisy=first)
 
 
 def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothing: Smoothing) -> tuple[Block, Noise]:
     """Return a block of contacts that is active at any known distance, and its noise."""
-    each, kernel, length = block.rows_each, smoothing.noise, smoothing.length.astype(block.residual.dtype)
+    each, length = block.rows_each, smoothing.length.astype(block.residual.dtype)
     distance = jnp.where(known, block.residual[::each], 1.0)
     # Impedance at the mean of -(r + w) given that it is positive (m).
-    resistance = impedance(block.solimp[::each], length * kernel.depth(distance / length))
+    resistance = impedance(block.solimp[::each], length * normal.depth(distance / length))
     spread = functools.partial(per_row, each=each)
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)

@@ -9,7 +9,7 @@ Matrix products request full precision: NVIDIA GPUs otherwise round factors to t
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import jax
@@ -76,20 +76,16 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
     if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
         kind = model.opt.integrator
         raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
+    has_stages = model.opt.integrator == _Integrator.mjINT_RK4
+    ways: tuple[Callable, Callable] = (_stages, _after_stages) if has_stages else (_forward, _after_one)
+    evaluate, finish = ways
     with _at_full_precision(model, data):
         if not isinstance(contact, Slope):
-            return _step(model, data, contact)
-        moved = _step(*jax.lax.stop_gradient((model, data)), Discrete())
-        return jax.tree.map(_with_derivative_of, moved, _step(model, data, contact, moved.qvel))
-
-
-def _step(model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector | None = None) -> mjx.Data:
-    """Return data one step later; `after` is that of `_forward`."""
-    if model.opt.integrator == _Integrator.mjINT_RK4:
-        return _runge_kutta(model, data, contact, after)
-    data = _forward(model, data, contact, after)
-    is_euler = model.opt.integrator == _Integrator.mjINT_EULER
-    return _advance(model, data, (_euler_acceleration if is_euler else _implicit_acceleration)(model, data), None)
+            return finish(model, data, evaluate(model, data, contact))
+        fixed, still = jax.lax.stop_gradient((model, data))
+        moved = finish(fixed, still, evaluate(fixed, still, Discrete()))
+        other = finish(model, data, evaluate(model, data, contact, moved.qvel))
+        return jax.tree.map(_with_derivative_of, moved, other)
 
 
 def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> mjx.Data:
@@ -255,6 +251,12 @@ def _smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
 
 
+def _after_one(model: mjx.Model, _: mjx.Data, data: mjx.Data) -> mjx.Data:
+    """Return data one step later, from the accelerations of `_forward`."""
+    is_euler = model.opt.integrator == _Integrator.mjINT_EULER
+    return _advance(model, data, (_euler_acceleration if is_euler else _implicit_acceleration)(model, data), None)
+
+
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off.
 
@@ -289,8 +291,10 @@ def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: 
     return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
 
 
-def _runge_kutta(model: mjx.Model, start: mjx.Data, contact: Contact, after: _Vector | None) -> mjx.Data:
-    """Advance by the classical fourth-order rule.
+def _stages(
+    model: mjx.Model, start: mjx.Data, contact: Contact, after: _Vector | None = None
+) -> tuple[tuple[Array, ...], mjx.Data]:
+    """Return the mean rates of position, velocity and activations by the classical fourth-order rule, and its four stages.
 
     All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
     """
@@ -314,7 +318,13 @@ def _runge_kutta(model: mjx.Model, start: mjx.Data, contact: Contact, after: _Ve
 
     tableau = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6)
     tableau = jax.tree.map(lambda x: x.astype(start.qvel.dtype), tableau)
-    (_, (velocity, acceleration, act_dot), _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
+    (_, means, _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
+    return means, stages
+
+
+def _after_stages(model: mjx.Model, start: mjx.Data, found: tuple[tuple[Array, ...], mjx.Data]) -> mjx.Data:
+    """Return data one step later, from the result of `_stages`."""
+    (velocity, acceleration, act_dot), stages = found
     last = jax.tree.map(lambda x: x[-1], stages).replace(
         qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
     )

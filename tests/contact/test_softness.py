@@ -167,7 +167,7 @@ def test_values_without_meaning_are_refused(part, value, requirement):
 
 def test_a_sweep_is_one_vmap(unequal):
     stiffness = np.array([1e2, 1e3, 1e4])
-    sweep = Softness.sweep(stiffness=stiffness, damping_ratio=1.0, impedance=(0.2, 0.4))
+    sweep = Softness(stiffness, np.ones(3), np.tile([0.2, 0.4], (3, 1)))
     got = jax.jit(jax.vmap(lambda s: unequal.with_softness(s).contact_parameters()))(sweep)
     np.testing.assert_allclose(got.stiffness, np.tile(stiffness[:, None], len(unequal.pairs)))
     np.testing.assert_allclose(got.impedance[..., 0], 0.2)
@@ -176,7 +176,7 @@ def test_a_sweep_is_one_vmap(unequal):
 
 def test_a_sweep_without_vmap_is_refused(unequal):
     with pytest.raises(ValueError, match=r"stiffness must be one value.*vmap"):
-        unequal.with_softness(Softness.sweep(stiffness=[1, 2], damping_ratio=1))
+        unequal.with_softness(Softness(stiffness=[1, 2], damping_ratio=1))
 
 
 def test_derivatives_are_those_of_the_closed_form(unequal):

@@ -227,8 +227,8 @@ def test_to_plan_again_compiles_nothing(compilations):
 
 
 def test_a_smoother_scales_all_that_has_a_length():
-    analytic = Analytic(Smoothing(0.2, "logistic")).scaled(0.5)
-    assert (analytic.smoothing.length, analytic.smoothing.kernel) == (0.1, "logistic")
+    analytic = Analytic(Smoothing(0.2, "backward")).scaled(0.5)
+    assert (analytic.smoothing.length, analytic.smoothing.mode) == (0.1, "backward")
     sampled = Sampled(jnp.array([0.2, 0.4]), 0.6, 3).scaled(0.5)
     np.testing.assert_allclose(sampled.stddev_state, [0.1, 0.2])
     np.testing.assert_allclose(sampled.stddev_control, 0.3)

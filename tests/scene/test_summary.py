@@ -79,7 +79,7 @@ def test_columns_are_aligned(scene):
 
 
 def test_a_batch_has_no_summary(scene):
-    sweep = Softness.sweep(stiffness=[1e2, 1e3], damping_ratio=1)
+    sweep = Softness(stiffness=[1e2, 1e3], damping_ratio=[1, 1])
     batch = jax.vmap(scene.with_softness)(sweep)
     with pytest.raises(ValueError, match="one scene with known values"):
         batch.summary()

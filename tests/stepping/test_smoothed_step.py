@@ -13,9 +13,7 @@ from scipy import optimize
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import SceneWarning
-from mjxgrad.solver.kernels import KERNELS
 from mjxgrad.stepping import check_contact, own_motion, smoothing_warnings
-from tests.solver.test_kernels import DISTRIBUTIONS
 from tests.solver.test_smoothed_law import _nodes
 
 # A ball that can move up and sideways over a plane, and a slider with a limit; impedance rises with depth.
@@ -49,7 +47,7 @@ def _at(height, sink=SINK, slide=0.0, limit=0.0, contact=mg.Discrete(), **scene)
     return np.asarray(_acceleration(model, data, position, velocity, contact))
 
 
-# Other laws than the plain Gaussian's compile for a while; what is theirs, `test_law` tests apart from the step.
+# Other laws than the plain one compile for a while; what is theirs, `test_law` tests apart from the step.
 scenes = pytest.mark.parametrize(
     "scene",
     [
@@ -59,16 +57,13 @@ scenes = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "gaussian" else pytest.param(name, marks=pytest.mark.slow) for name in KERNELS]
-)
-def test_acceleration_balances_the_mean_force_under_noise(name):
+def test_acceleration_balances_the_mean_force_under_noise():
     """Root of a + g = F(a), the force averaged over noise by quadrature: the solve's own accuracy, 1e-8.
 
     solref is (0.02, 1), so K = (dw tc)⁻², B = 2 / (dw tc); the compiled inverse weight is 1/m. With power 2 and midpoint 1/2 the
     impedance at depth e < width / 2 is d0 + (dw - d0) 2 (e/width)²; e is the mean penetration under noise where there is one.
     """
-    w, share = _nodes(np.array([-HEIGHT / LENGTH]), DISTRIBUTIONS[name])
+    w, share = _nodes(np.array([-HEIGHT / LENGTH]))
     touches = LENGTH * w < -HEIGHT
     depth = -np.sum(share * (HEIGHT + LENGTH * w) * touches) / np.sum(share * touches)
     assert depth < 0.5 * 4e-3
@@ -78,12 +73,12 @@ def test_acceleration_balances_the_mean_force_under_noise(name):
     def excess(a):
         x = a + damping * SINK + rate * HEIGHT
         last = min(-HEIGHT, -x / rate) / LENGTH
-        w, share = _nodes(np.array([last]), DISTRIBUTIONS[name])
+        w, share = _nodes(np.array([last]))
         push = np.where(w < last, x + rate * LENGTH * w, 0.0)
         return 2 * (a + 9.81) + weight * np.sum(share * push)
 
     exact = optimize.brentq(excess, -20, 100, xtol=1e-13)
-    found = _at(HEIGHT, contact=mg.Smoothing(LENGTH, name))[0]
+    found = _at(HEIGHT, contact=mg.Smoothing(LENGTH))[0]
     assert found == pytest.approx(exact, rel=1e-8)
     assert found > -9.0  # it is not the fall
 
@@ -184,23 +179,21 @@ BOX = """<mujoco><worldbody>
 
 @pytest.mark.parametrize(("shape", "is_felt"), [('type="capsule" size=".1 .05"', False), ('size=".1"', True)])
 def test_what_has_no_force_at_a_distance_over_a_box_is_warned_of(shape, is_felt):
-    """Of a capsule MJX says 1 m in place of 5 mm, within reach of the log barrier; a ball's distance is known from anywhere."""
+    """Of a capsule MJX says 1 m in place of 5 mm, within reach of the noise; a ball's distance is known from anywhere."""
     model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX.replace('type="capsule" size=".1 .05"', shape)))
-    smoothing = mg.Smoothing(5e-3, "log_barrier")
+    smoothing = mg.Smoothing(5e-3)
     (acceleration,) = eqx.filter_jit(mg.forward)(model, mjx.make_data(model), contact=smoothing).qacc
     assert acceleration > -9.81 + 1 if is_felt else abs(acceleration + 9.81) < 1e-12
     assert ["pin – box" in text for text in smoothing_warnings(smoothing, model)] == [True] * (not is_felt)
 
 
 def test_a_scene_without_contact_is_named():
-    """By the rollout, too, with the scene's name and the kernel's."""
+    """By the rollout, too, with the scene's name."""
     scene = mg.load_scene(
         '<mujoco model="void"><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
     )
-    with pytest.warns(SceneWarning, match="logistic contact has no effect"):
-        jax.eval_shape(
-            lambda s: mg.rollout(scene, s, horizon=2, contact=mg.Smoothing(1e-3, "logistic")), mg.initial_state(scene)
-        )
+    with pytest.warns(SceneWarning, match="MJCF: smoothing has no effect"):
+        jax.eval_shape(lambda s: mg.rollout(scene, s, horizon=2, contact=mg.Smoothing(1e-3)), mg.initial_state(scene))
 
 
 @pytest.mark.parametrize(
@@ -209,10 +202,6 @@ def test_a_scene_without_contact_is_named():
         ({"length": 0.0}, "length must be positive and finite, got 0.0"),
         ({"length": -1e-3}, "length must be positive"),
         ({"length": [1e-3, np.inf]}, "length must be positive"),
-        (
-            {"length": 1e-3, "kernel": "cauchy"},
-            "kernel must be one of 'gaussian', 'logistic', 'log_barrier', got 'cauchy'",
-        ),
         ({"length": 1e-3, "mode": "both"}, "mode must be one of 'forward', 'backward', got 'both'"),
     ],
 )

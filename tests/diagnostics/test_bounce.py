@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.contact.bounce import Bounce
 from mjxgrad.diagnostics import compare_to_slope, phases
+from mjxgrad.diagnostics.stability import bounce_angle, restitution
 from mjxgrad.stepping import own_motion
 
 DURATION = 0.1
@@ -39,22 +39,23 @@ def found():
 
 def test_a_critically_damped_ball_keeps_the_share_exp_minus_two():
     """Then x = v t exp(−ω t): its acceleration vanishes at ω t = 2, where the speed is −v exp(−2)."""
-    assert float(Bounce(0.02, 1.0).restitution) == pytest.approx(np.exp(-2), rel=1e-12)
-    assert float(Bounce(0.02, 1.0).duration) == pytest.approx(2 * 0.02, rel=1e-12)
+    assert restitution(1.0) == pytest.approx(np.exp(-2), rel=1e-12)
+    assert bounce_angle(1.0) == 1.0
 
 
 def test_nothing_jumps_where_damping_becomes_critical():
-    """Just inside and outside of the series about ζ = 1 values agree to its first left-out term, 1e-12."""
-    for edge in (1 - 1e-4, 1 + 1e-4):
-        near, far = Bounce(0.02, edge * (1 - 1e-9)), Bounce(0.02, edge * (1 + 1e-9))
-        assert float(near.restitution) == pytest.approx(float(far.restitution), rel=1e-8)
-    slopes = jax.vmap(jax.grad(lambda ratio: Bounce(0.02, ratio).restitution))(jnp.array([0.999, 1.0, 1.001]))
-    assert float(slopes[1]) == pytest.approx(float((slopes[0] + slopes[2]) / 2), rel=1e-5)
+    """About ζ = 1 the angle is 1 + (1 − ζ)/3, to the square of the gap."""
+    for gap in (1e-9, -1e-9, 1e-5, -1e-5):
+        assert bounce_angle(1 - gap) == pytest.approx(1 + gap / 3, abs=1e-10)
 
 
 def test_the_simulated_height_is_that_of_the_closed_form(found):
-    """Semi-implicit steps are of first order: the ball is off by about one step's flight, v h."""
-    exact = Bounce(0.02, 1.0).height(found.parameters, DURATION)
+    """Semi-implicit steps are of first order: the ball is off by about one step's flight, v h.
+
+    At critical damping contact takes 2 / ω = 2 t_c and ends at v t exp(−ω t), two t_c exp(−2) deep at 1 m/s.
+    """
+    flown = DURATION - found.parameters - 2 * 0.02
+    exact = np.exp(-2) * (flown - 2 * 0.02)
     assert np.abs(found.outcomes - np.asarray(exact)).max() < 1.0 * TIMESTEP
 
 
