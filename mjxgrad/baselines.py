@@ -14,13 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mjxgrad._arrays import whole
+from mjxgrad.estimators.moments import Moments
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
 from mjxgrad.loop.run import run
-from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise
+from mjxgrad.objective import Objective, OpenLoop, ParameterNoise
 from mjxgrad.objective.base import as_objective
 
 __all__ = ["Population", "cross_entropy"]
@@ -52,7 +53,8 @@ class Population(Descent):
         directions = jax.random.normal(search_key, (self.num_samples, params.size), params.dtype)
         at = params + width * (directions.at[0].set(0) if self.has_present else directions)
         rollout_keys = jax.random.split(rollout_key, self.num_samples)
-        costs = jax.vmap(objective.value)(at, jax.vmap(lambda one: without_action_noise(objective, one))(rollout_keys))
+        noise = jax.vmap(lambda one: objective.silence(objective.sample_noise(one)))(rollout_keys)
+        costs = jax.vmap(objective.value)(at, noise)
         is_finite = jnp.isfinite(costs)
         is_taken = is_finite.sum() >= self.least_finite
         new, stddev = self.move(params, width, at, jnp.where(is_finite, costs, jnp.inf))
@@ -111,15 +113,6 @@ def cross_entropy(
     return run(method, **method.begun(params, key))
 
 
-def without_action_noise(objective: Objective, key: PRNGKeyArray) -> PyTree:
-    """Return rollout noise with none on actions or parameters, but a random start where the task has one."""
-    if isinstance(objective, ActionNoise):
-        _, start = objective.split(objective.sample_noise(key))
-        if start is not None:
-            return jnp.zeros(objective.noise_shape, objective.stddev.dtype), start
-    return objective.zero_noise()
-
-
 def search_stddev(
     objective: Objective, params: Float[Array, "..."], stddev: ArrayLike | None, num_samples: int
 ) -> Float[Array, " dim"]:
@@ -150,14 +143,11 @@ def _record(
     step_norm: Float[Array, ""],
     is_taken: Bool[Array, ""],
 ) -> Record:
-    count = is_finite.sum()
-    mean = jnp.where(count > 0, jnp.mean(costs, where=is_finite), jnp.nan)
-    variance = jnp.sum(jnp.where(is_finite, costs - mean, 0) ** 2) / jnp.maximum(count - 1, 1)
-    error = jnp.where(count > 1, jnp.sqrt(variance / jnp.maximum(count, 1)), jnp.nan)
+    found = Moments.of(costs, is_finite)
     return dataclasses.replace(
         Record.blank(costs.dtype),
-        cost=mean,
-        cost_error=error.astype(costs.dtype),
+        cost=jnp.where(found.count > 0, found.mean, jnp.nan),
+        cost_error=jnp.sqrt(found.squared_error()),
         scale=jnp.ones((), costs.dtype),
         step_norm=step_norm,
         finite_fraction=is_finite.mean(dtype=costs.dtype),

@@ -441,7 +441,7 @@ def _in_batches(
     batches = jax.tree.map(lambda leaf: leaf[: count * _BATCH].reshape(count, _BATCH, *leaf.shape[1:]), samples)
 
     def one(batch: Samples) -> tuple[Array, Array, Array]:
-        (parts,) = both_parts(batch, control_variate=True)
+        parts = both_parts(batch, control_variate=True)
         alpha = weigh(Consistent(), parts, plan).alpha
         value, _ = parts.mixture(jnp.broadcast_to(alpha, parts.first.offset.shape))
         return jnp.where(parts.unbiased.count > 1, value, jnp.nan), alpha, parts.unbiased.count > 1
@@ -461,7 +461,7 @@ def _in_batches(
 
 def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Return the unbiased part of α-order and its standard error; see `control_variate`."""
-    (parts,) = both_parts(samples, control_variate=True)
+    parts = both_parts(samples, control_variate=True)
     value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
     return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
-from mjxgrad.estimators.moments import Moments, ScoreMoments, Total, as_real
+from mjxgrad.estimators.moments import Moments, ScoreMoments, as_real
 from mjxgrad.estimators.samples import Plan, Samples, plan_for_baseline, stream
 from mjxgrad.objective import Objective, as_vector
 
@@ -102,41 +102,39 @@ def first_and_zeroth_order(
     return both_results(stream(objective, vector, key, plan, both_summary), plan, baseline, restore)
 
 
-def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Total]:
+def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Array]:
     """Return the moments of gradients and of costs, and the number of units that felt their noise."""
     mask = samples.first_order_mask()
     gradients = Moments.of(samples.gradients.mean(axis=1), mask)
-    return gradients, Moments.of(samples.costs.mean(axis=1), mask), Total(samples.num_felt())
+    return gradients, Moments.of(samples.costs.mean(axis=1), mask), samples.num_felt()
 
 
 def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) -> GradientEstimate:
     """Return the estimate from the summary of `first_order_summary`."""
-    gradients, costs, felt = summary
+    gradients, costs, num_felt = summary
     return assemble(
         gradients.mean,
         gradients.squared_error(),
         costs,
         plan,
         count=gradients.count,
-        num_felt=felt.value,
+        num_felt=num_felt,
         restore=restore,
         alpha=1.0,
         bias_bound=jnp.nan,
     )
 
 
-def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Total]:
-    """Return joint moments of costs and scores, moments of the costs, and the cost without noise."""
+def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Array, Array]:
+    """Return joint moments of costs and scores, moments of the costs, the cost without noise, and units that felt it."""
     mask = samples.zeroth_order_mask()
     moments = ScoreMoments.of(samples.costs - samples.zero_noise_costs[:, None], samples.scores, mask)
-    sums = Total((samples.noise_free_cost(), samples.num_felt()))
-    return moments, Moments.of(samples.costs.mean(axis=1), mask), sums
+    return moments, Moments.of(samples.costs.mean(axis=1), mask), samples.noise_free_cost(), samples.num_felt()
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, restore: Callable) -> GradientEstimate:
     """Return the estimate from the summary of `zeroth_order_summary`."""
-    moments, costs, sums = summary
-    noise_free_cost, num_felt = sums.value
+    moments, costs, noise_free_cost, num_felt = summary
     if baseline == "leave_one_out":
         value, squared_error = _leave_one_out(moments)
     else:
@@ -157,15 +155,15 @@ def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, res
 
 
 def both_summary(samples: Samples) -> tuple:
-    """Return the summaries of both estimates, one after the other."""
-    return *first_order_summary(samples), *zeroth_order_summary(samples)
+    """Return the summaries of both estimates."""
+    return first_order_summary(samples), zeroth_order_summary(samples)
 
 
 def both_results(
-    kept: tuple, plan: Plan, baseline: str, restore: Callable
+    summary: tuple, plan: Plan, baseline: str, restore: Callable
 ) -> tuple[GradientEstimate, GradientEstimate]:
     """Return both estimates from the summary of `both_summary`."""
-    return first_order_result(kept[:3], plan, restore), zeroth_order_result(kept[3:], plan, baseline, restore)
+    return first_order_result(summary[0], plan, restore), zeroth_order_result(summary[1], plan, baseline, restore)
 
 
 def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:

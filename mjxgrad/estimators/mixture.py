@@ -1,16 +1,15 @@
 """Mixtures of a first-order and an unbiased estimate from the same rollouts, and the evidence that weighs them."""
 
 import functools
-from typing import Any
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.consistency import SecantSums, secant_sums
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
-from mjxgrad.estimators.moments import Moments, Summary, as_real
-from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Weights
+from mjxgrad.estimators.moments import Moments, as_real
+from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Weights, norm
 from mjxgrad.estimators.samples import Group, Plan, Samples, plan_by_noise, stream
 from mjxgrad.estimators.unbiased import UnbiasedTerms, gram, unbiased_terms
 from mjxgrad.objective import Objective, as_vector
@@ -50,7 +49,7 @@ def alpha_order(
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
-    (parts,) = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
+    parts = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
     weights = weigh(rule or Consistent(), parts, plan)
     value, squared_error = parts.mixture(weights.alpha)
     return assemble(
@@ -86,7 +85,7 @@ def control_variate(
     return alpha_order(objective, params, key, num_samples=num_samples, rule=rule, chunk_size=chunk_size)
 
 
-class Parts(Summary):
+class Parts(eqx.Module):
     """Moments of both parts over all units: samples, or pairs where starts are random.
 
     Attributes:
@@ -115,30 +114,19 @@ class Parts(Summary):
     num_groups: Float[Array, ""]
     num_felt: Int[Array, ""]
 
-    def merge(self, other: "Parts") -> "Parts":
-        def both(mine: Any, theirs: Any) -> Any:
-            return mine.merge(theirs) if isinstance(mine, Moments) else mine + theirs
-
-        return jax.tree.map(both, self, other, is_leaf=lambda leaf: isinstance(leaf, Moments))
-
     def evidence(self) -> Evidence:
         """Return the evidence for a rule, with all coordinates as one block."""
         missed, explained = self.secants.missed_variance(), self.linear_variance / jnp.maximum(self.num_costs, 1)
         bound = jnp.sqrt(missed / jnp.where(explained > 0, explained, jnp.nan))
-        return Evidence(
-            count=self.first.count,
-            dim=jnp.ones_like(self.first.offset).sum(),
-            first_norm=_norm(self.first.mean),
-            zeroth_norm=_norm(self.unbiased.mean),
-            difference_norm=_norm(self.difference.mean),
-            first_variance=self.first.variance().sum(),
-            zeroth_variance=self.unbiased.variance().sum(),
-            difference_variance=self.difference.variance().sum(),
+        return Evidence.of(
+            self.first,
+            self.unbiased,
+            self.difference,
             inconsistency=self.secants.inconsistency(),
             relative_bias_bound=jnp.where(missed == 0, 0, bound),
             cost_variance=self.costs.variance(),
             scaled_first_variance=self.scaled.variance().sum(),
-            scaled_first_norm=_norm(self.scaled.mean),
+            scaled_first_norm=norm(self.scaled.mean),
         )
 
     def mixture(self, alpha: Float[Array, "..."]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
@@ -165,7 +153,7 @@ class Parts(Summary):
         return spread + (remaining**2 - spread) / (num_groups * others**2 + 1)
 
 
-def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
+def both_parts(samples: Samples, *, control_variate: bool) -> Parts:
     """Return the summary of a chunk with both parts pulled back to the parameters."""
     chunk = Group.of(samples)
     groups = chunk.split()
@@ -183,7 +171,7 @@ def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
     has_both = has_cost & chunk.complete(chunk.has_derivative)
     unbiased, first = (chunk.by_unit(chunk.pull_back(samples, x)) for x in (terms_by_noise, chunk.derivatives))
     real_counts = as_real(num_costs, chunk.costs)
-    summary = Parts(
+    return Parts(
         first=Moments.of(first, has_both),
         unbiased=Moments.of(unbiased, has_cost),
         difference=Moments.of(unbiased - first, has_both),
@@ -196,7 +184,6 @@ def both_parts(samples: Samples, *, control_variate: bool) -> tuple[Parts]:
         num_groups=as_real((num_costs >= 2).sum(), chunk.costs),
         num_felt=samples.num_felt(),
     )
-    return (summary,)
 
 
 def weigh(rule: Rule, parts: Parts, plan: Plan) -> Weights:
@@ -208,7 +195,3 @@ def weigh(rule: Rule, parts: Parts, plan: Plan) -> Weights:
     alpha = jnp.where(has_first & ~is_nothing_felt(plan, parts.costs, parts.num_felt), weights.alpha, 0)
     reason = Reason.where(has_first, weights.reason, Reason.not_finite)
     return Weights(alpha, reason, jnp.where(alpha > 0, weights.bias_bound, 0))
-
-
-def _norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
-    return jnp.sqrt((vector**2).sum())

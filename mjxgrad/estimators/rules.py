@@ -15,6 +15,7 @@ from scipy import stats
 
 from mjxgrad._arrays import is_known
 from mjxgrad.estimators.estimate import Reason
+from mjxgrad.estimators.moments import Moments
 
 
 class Evidence(eqx.Module):
@@ -50,6 +51,16 @@ class Evidence(eqx.Module):
     cost_variance: Float[Array, "*blocks"]
     scaled_first_variance: Float[Array, "*blocks"]
     scaled_first_norm: Float[Array, "*blocks"]
+
+    @classmethod
+    def of(cls, first: Moments, zeroth: Moments, difference: Moments, **facts: Float[Array, ""]) -> "Evidence":
+        """Return the evidence of one block: moments of both parts and of their difference, and facts, NaN if not given."""
+        parts = {"first": first, "zeroth": zeroth, "difference": difference}
+        known = {f"{name}_norm": norm(part.mean) for name, part in parts.items()}
+        known |= {f"{name}_variance": part.variance().sum() for name, part in parts.items()}
+        unknown = dict.fromkeys(cls.__annotations__, jnp.full_like(known["first_norm"], jnp.nan))
+        dim = jnp.ones_like(first.offset).sum()
+        return cls(**{**unknown, **known, **facts, "count": first.count, "dim": dim})
 
     @property
     def real_count(self) -> Float[Array, "*blocks"]:
@@ -212,6 +223,11 @@ class Consistent(eqx.Module):
         reason = Reason.where(excess > 0, Reason.bias_limit, Reason.inverse_variance)
         reason = Reason.where(is_consistent, reason, Reason.inconsistent)
         return Weights(alpha, reason, alpha * evidence.relative_bias_bound * evidence.first_norm)
+
+
+def norm(vector: Float[Array, "*n"]) -> Float[Array, ""]:
+    """Return the Euclidean norm of a vector, the magnitude of a number."""
+    return jnp.sqrt((vector**2).sum())
 
 
 # Above this, a single coordinate is not the worst case among Gaussian quadratic forms.

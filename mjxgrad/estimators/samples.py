@@ -16,7 +16,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import one_key, whole
-from mjxgrad.estimators.moments import Summary
+from mjxgrad.estimators.moments import merged
 from mjxgrad.objective import Differentiated, Objective
 from mjxgrad.objective.base import unchanged, value_and_gradient
 
@@ -222,22 +222,22 @@ def stream(
     params: Float[Array, " dim"],
     key: PRNGKeyArray,
     plan: Plan,
-    summarise: Callable[[Samples], tuple[Summary, ...]],
-) -> tuple[Any, ...]:
-    """Roll out a plan chunk by chunk, and return the merged summaries."""
+    summarise: Callable[[Samples], Any],
+) -> Any:
+    """Roll out a plan chunk by chunk, and return the merged summary; see `moments`."""
     num_chunks, size = plan.chunks()
     total = plan.num_units + plan.with_zero_noise
     fewest, num_larger = divmod(total, num_chunks)
     sampled = functools.partial(sample, objective, params, key, plan)
 
     # The start of a chunk is in the carry: an array of all starts would grow with the number of samples.
-    def step(carry: tuple[Int[Array, ""], Int[Array, ""], tuple[Summary, ...]], _: None) -> tuple[tuple, None]:
+    def step(carry: tuple[Int[Array, ""], Int[Array, ""], Any], _: None) -> tuple[tuple, None]:
         chunk, start, kept = carry
         end = start + fewest + (chunk < num_larger)
         units = start + jnp.arange(size)
         # The padding of a chunk is no unit of the plan, nor the rollout without noise.
-        new_ones = summarise(sampled(jnp.where(units < end, units, total)))
-        return (chunk + 1, end, tuple(old.merge(new) for old, new in zip(kept, new_ones, strict=True))), None
+        new = summarise(sampled(jnp.where(units < end, units, total)))
+        return (chunk + 1, end, merged(kept, new)), None
 
     start = jnp.zeros((), int)
     shapes = jax.eval_shape(summarise, jax.eval_shape(sampled, start + jnp.arange(size)))
