@@ -28,12 +28,12 @@ class BraxEnv(Env):
 
     def reset(self, rng: PRNGKeyArray | UInt32[Array, "2"]) -> State:
         key = rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
-        changes, physics = self.environment.begin(key)
-        return _brax_state(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
+        copy_key, now = self.environment.begin(key)
+        return _brax_state(State(None, None, None, None, info={"copy_key": copy_key}), now)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: Float[Array, " nu"]) -> State:
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return _brax_state(state, self.environment.with_changes(state.info["changes"]).step(before, action))
+        return _brax_state(state, self.environment.randomised(state.info["copy_key"]).step(before, action))
 
     @property
     def observation_size(self) -> int:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
-from mjxgrad.objective.task import InScene, optional_pytree
+from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
@@ -73,7 +73,7 @@ class Environment(InScene):
     contact: Contact = eqx.field(default=Discrete(), kw_only=True)
     frame_skip: int = eqx.field(static=True, default=1, kw_only=True)
     episode_length: int = eqx.field(static=True, default=1000, kw_only=True)
-    randomisation: Randomisation | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
+    randomisation: Randomisation | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
 
     def __check_init__(self):
         for name in ("frame_skip", "episode_length"):
@@ -216,22 +216,7 @@ class Environment(InScene):
         scene = eqx.tree_at(lambda s: s.model.opt.timestep, self.scene, self.scene.model.opt.timestep / times)
         return dataclasses.replace(self, scene=scene, frame_skip=times * self.frame_skip)
 
-    def changes(self, key: PRNGKeyArray) -> PyTree:
-        """Draw the numbers in which one copy differs, see `randomised`; a batch of copies shares all others.
-
-        Returns:
-            The copy's own numbers, for `with_changes`.
-        """
-        pairs = zip(jax.tree.leaves(self.randomised(key)), jax.tree.leaves(self), strict=True)
-        return [None if copied is own else copied for copied, own in pairs]
-
-    def with_changes(self, changes: PyTree) -> "Environment":
-        """Return the copy with its own numbers, as drawn by `changes`."""
-        own, structure = jax.tree.flatten(self)
-        return structure.unflatten([x if new is None else new for x, new in zip(own, changes, strict=True)])
-
-    def begin(self, key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
-        """Return the changes of one copy, and the start of its first episode."""
+    def begin(self, key: PRNGKeyArray) -> tuple[PRNGKeyArray, EnvState]:
+        """Return the key of one copy, for `randomised`, and the start of its first episode."""
         copy_key, reset_key = jax.random.split(key)
-        changes = self.changes(copy_key)
-        return changes, self.with_changes(changes).reset(reset_key)
+        return copy_key, self.randomised(copy_key).reset(reset_key)

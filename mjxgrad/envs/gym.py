@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad.envs import ENVIRONMENTS, load
 from mjxgrad.envs.environment import Environment, EnvState
@@ -69,17 +69,15 @@ class GymEnv(_Adapter, gymnasium.Env):
         self._prepare(environment, render_mode, view)
         self.observation_space, self.action_space = self._spaces()
         self._begin = jax.jit(lambda key: self.environment.begin(key))
-        self._advance = jax.jit(
-            lambda changes, state, action: self.environment.with_changes(changes).step(state, action)
-        )
+        self._advance = jax.jit(lambda key, state, action: self.environment.randomised(key).step(state, action))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
         super().reset(seed=seed, options=options)
-        self._changes, self._state = self._begin(_key(self.np_random))
+        self._copy_key, self._state = self._begin(_key(self.np_random))
         return np.asarray(self._state.obs), _info(self._state)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, _Info]:
-        state = self._state = self._advance(self._changes, self._state, jnp.asarray(action))
+        state = self._state = self._advance(self._copy_key, self._state, jnp.asarray(action))
         return np.asarray(state.obs), float(state.reward), bool(state.terminated), bool(state.truncated), _info(state)
 
     def render(self) -> np.ndarray | None:
@@ -107,21 +105,19 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        def begin(key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
-            return jax.vmap(self.environment.begin)(jax.random.split(key, num_envs))
+        def advance(key: PRNGKeyArray, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
+            return self.environment.randomised(key).step_on(state, action)
 
-        def advance(changes: PyTree, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
-            return self.environment.with_changes(changes).step_on(state, action)
-
-        self._begin, self._advance = jax.jit(begin), jax.jit(jax.vmap(advance))
+        self._begin = jax.jit(lambda key: jax.vmap(self.environment.begin)(jax.random.split(key, num_envs)))
+        self._advance = jax.jit(jax.vmap(advance))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
         super().reset(seed=seed, options=options)
-        self._changes, self._state = self._begin(_key(self.np_random))
+        self._copy_keys, self._state = self._begin(_key(self.np_random))
         return np.asarray(self._state.obs), self._info(self._state)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Info]:
-        ended, self._state = self._advance(self._changes, self._state, jnp.asarray(actions))
+        ended, self._state = self._advance(self._copy_keys, self._state, jnp.asarray(actions))
         done = np.asarray(ended.done)
         infos = {**self._ends(ended, done), **self._info(self._state)}
         outcome = (np.asarray(x) for x in (self._state.obs, ended.reward, ended.terminated, ended.truncated))
@@ -145,17 +141,6 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         return infos
 
 
-def register() -> None:
-    """Register `ENVIRONMENTS` with gymnasium."""
-    for name in ENVIRONMENTS:
-        gymnasium.register(
-            gym_name(name),
-            entry_point=f"{__name__}:{GymEnv.__name__}",
-            vector_entry_point=f"{__name__}:{GymVectorEnv.__name__}",
-            kwargs={"environment": name},
-        )
-
-
 def gym_name(name: str) -> str:
     """Return gymnasium's name of one of `ENVIRONMENTS`: `diffrl_ant` is `mjxgrad/DiffRLAnt-v0`."""
     words = ["DiffRL" if word == "diffrl" else word.capitalize() for word in name.split("_")]
@@ -170,4 +155,6 @@ def _info(state: EnvState) -> _Info:
     return {name: float(value) for name, value in state.metrics.items()}
 
 
-register()
+for _name in ENVIRONMENTS:
+    _entry_points = {"entry_point": f"{__name__}:GymEnv", "vector_entry_point": f"{__name__}:GymVectorEnv"}
+    gymnasium.register(gym_name(_name), **_entry_points, kwargs={"environment": _name})

@@ -208,33 +208,25 @@ def estimated_gradient(
     """
     rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
-    def init(params: PyTree) -> EstimatedGradientState:
+    def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Float[Array, ""], GradientEstimate]:
         vector, restore = flattened(params)
+        scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
+        return scale, jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, step)))
 
-        def first(
-            vector: Float[Array, " dim"], key: PRNGKeyArray, step: Int[Array, ""]
-        ) -> tuple[Float[Array, ""], GradientEstimate]:
-            scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
-            return scale, estimator(annealed, vector, key)
-
+    def init(params: PyTree) -> EstimatedGradientState:
         zero = jnp.zeros((), jnp.int32)
-        shapes = jax.eval_shape(first, vector, key, zero)
+        shapes = jax.eval_shape(lambda step: estimated(params, step), zero)
         nothing = lambda x: jnp.full(x.shape, jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else 0, x.dtype)  # noqa: E731
         scale, estimate = jax.tree.map(nothing, shapes)
-        return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(vector))
+        return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(flattened(params)[0]))
 
     def update(
-        updates: PyTree,
-        state: EstimatedGradientState,
-        params: PyTree = None,
-        **unused: Any,
+        updates: PyTree, state: EstimatedGradientState, params: PyTree = None, **_: Any
     ) -> tuple[PyTree, EstimatedGradientState]:
-        del unused  # extra arguments of others in a chain
         if params is None:
             raise ValueError("params must be given to update, got None: the gradient is estimated there")
         vector, restore = flattened(params)
-        scale, annealed = rule.annealed(of_vector(objective, restore), vector, state.step)
-        estimate = jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, state.step)))
+        scale, estimate = estimated(params, state.step)
         gradient = estimate.value if updates is None else estimate.value + flattened(updates)[0]
         change, inner, is_taken = rule.change(vector, state.inner, estimate, gradient)
         moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)

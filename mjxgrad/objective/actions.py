@@ -36,8 +36,8 @@ class ActionNoise(Objective):
     stddev: eqx.AbstractVar[Float[Array, "..."]]
 
     @abstractmethod
-    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out once; return the cost, the states, and the costs by step where the task gives them."""
+    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, ...]:
+        """Return the first arguments of the task's `run`: the controls, or the policy and its parameters."""
 
     @abstractmethod
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
@@ -89,6 +89,12 @@ class ActionNoise(Objective):
         """Return the action noise and the start, None where the start is not random."""
         return noise if isinstance(noise, tuple) else (noise, None)
 
+    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
+        """Roll out once; return the cost, the states, and the costs by step where the task gives them."""
+        actions, start = self.split(noise)
+        outcome = self.task.run(*self.controls(params), noise=actions.astype(params.dtype), start=start)
+        return dataclasses.replace(outcome, cost=as_scalar(outcome.cost, "the task's cost"))
+
     def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
         return self.outcome(params, noise).cost
 
@@ -137,9 +143,8 @@ class OpenLoop(ActionNoise):
         """Return parameters in the shape of controls."""
         return params.reshape(self.noise_shape)
 
-    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        actions, start = self.split(noise)
-        return _checked(self.task.run(self.unravel(params), noise=actions.astype(params.dtype), start=start))
+    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, ...]:
+        return (self.unravel(params),)
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
         return self._noise_score(params, noise)
@@ -161,9 +166,8 @@ class ClosedLoop(ActionNoise):
         """Return the policy's parameters as a vector."""
         return _flat(policy_params)[0]
 
-    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        actions, start = self.split(noise)
-        return _checked(self.task.run(self.policy, self.unravel(params), actions.astype(params.dtype), start))
+    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, ...]:
+        return self.policy, self.unravel(params)
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
         """Return Σ_t (∂π(x_t)/∂θ)ᵀ w_t/σ²; it takes a rollout."""
@@ -266,10 +270,6 @@ class _ActionsTranspose:
 
         _, transpose = jax.vjp(actions, params)
         return transpose(by_actions)[0]
-
-
-def _checked(outcome: Outcome) -> Outcome:
-    return dataclasses.replace(outcome, cost=as_scalar(outcome.cost, "the task's cost"))
 
 
 def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:

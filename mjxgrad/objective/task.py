@@ -3,7 +3,7 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -71,16 +71,10 @@ class Task(eqx.Module):
         return None
 
 
-def as_pytree(function: Callable) -> Callable:
-    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap."""
-    if isinstance(function, eqx.Module | jax.tree_util.Partial):
-        return function  # pyright: ignore[reportReturnType]
-    return jax.tree_util.Partial(function)
-
-
-def optional_pytree(function: Callable | None) -> Callable | None:
-    """Return a function as a pytree, see `as_pytree`, or None."""
-    return None if function is None else as_pytree(function)
+def as_pytree(function: Any) -> Any:
+    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap; None stays None."""
+    is_one = function is None or isinstance(function, eqx.Module | jax.tree_util.Partial)
+    return function if is_one else jax.tree_util.Partial(function)
 
 
 # Not typing.Self, which beartype refuses in methods that are checked one by one.
@@ -104,9 +98,9 @@ class InScene(eqx.Module):
         check_contact(contact)
         return dataclasses.replace(self, contact=contact)
 
-    def with_softness(self: Same, softness: Softness) -> Same:
-        """Return a copy with other contact softness."""
-        return dataclasses.replace(self, scene=self.scene.with_softness(softness))
+    def with_softness(self: Same, softness: Softness | None) -> Same:
+        """Return a copy with other contact softness; None leaves it unchanged."""
+        return self if softness is None else dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
 class SceneTask(Task, InScene):
@@ -125,8 +119,8 @@ class SceneTask(Task, InScene):
     state: State
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
-    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
-    observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
+    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=as_pytree, default=None)
+    observe: Observe | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
     @property

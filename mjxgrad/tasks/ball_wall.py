@@ -50,8 +50,7 @@ class BallWall(InScene):
 
         Softness applies to all contacts, and None leaves it unchanged; for the wall alone see `wall_softness`.
         """
-        task = self if softness is None else self.with_softness(softness)
-        return parameter_noise(task.cost, stddev, dim=1)
+        return parameter_noise(self.with_softness(softness).cost, stddev, dim=1)
 
 
 def ball_wall() -> BallWall:
