@@ -36,8 +36,8 @@ class ActionNoise(Objective):
     stddev: eqx.AbstractVar[Float[Array, "..."]]
 
     @abstractmethod
-    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, ...]:
-        """Return the first arguments of the task's `run`: the controls, or the policy and its parameters."""
+    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, PyTree]:
+        """Return the first arguments of the task's `run`: controls or policy, and the policy's parameters."""
 
     @abstractmethod
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
@@ -92,7 +92,7 @@ class ActionNoise(Objective):
     def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
         """Roll out once; return the cost, the states, and the costs by step where the task gives them."""
         actions, start = self.split(noise)
-        outcome = self.task.run(*self.controls(params), noise=actions.astype(params.dtype), start=start)
+        outcome = self.task.run(*self.controls(params), actions.astype(params.dtype), start)
         return dataclasses.replace(outcome, cost=as_scalar(outcome.cost, "the task's cost"))
 
     def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
@@ -143,8 +143,8 @@ class OpenLoop(ActionNoise):
         """Return parameters in the shape of controls."""
         return params.reshape(self.noise_shape)
 
-    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, ...]:
-        return (self.unravel(params),)
+    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, PyTree]:
+        return self.unravel(params), None
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
         return self._noise_score(params, noise)
@@ -166,7 +166,7 @@ class ClosedLoop(ActionNoise):
         """Return the policy's parameters as a vector."""
         return _flat(policy_params)[0]
 
-    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, ...]:
+    def controls(self, params: Float[Array, " dim"]) -> tuple[Any, PyTree]:
         return self.policy, self.unravel(params)
 
     def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:

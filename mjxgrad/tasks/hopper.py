@@ -4,8 +4,7 @@ Nothing in it jumps, and yet its policy gradient is the hardest case of the disc
 first touch, so the derivative is wrong for every parameter that shifts the time of landing.
 """
 
-import dataclasses
-
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -35,7 +34,8 @@ def hopper(*, horizon: int = 150) -> ActionTask:
     policy, zero = linear_policy(6, 3, observe=joints)
     stiffness, damping = jnp.array(STIFFNESS), jnp.array(DAMPING)
     gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
-    posture = dataclasses.replace(zero, gain=gain, offset=stiffness * jnp.array(START_POSE[3:]))
+    offset = stiffness * jnp.array(START_POSE[3:])
+    posture = eqx.tree_at(lambda layer: (layer.weight, layer.bias), zero, (gain, offset))
     # The number of controls is the scene's; pyright expects an argument, since `Task` declares a variable.
     return ActionTask(  # pyright: ignore[reportCallIssue]
         scene=scene,
