@@ -40,14 +40,13 @@ class Reason(eqx.Enumeration):
 class GradientEstimate(eqx.Module):
     r"""An estimate of $\nabla F(\theta)$ with its errors and the rollouts spent on it.
 
-    `covariance_diagonal` is per rollout for every estimator: `standard_error` is the root of it divided by `num_finite`.
-    It accounts for the dependence of samples through a leave-one-out baseline and through antithetic pairs.
+    Errors account for the dependence of samples through a leave-one-out baseline and through antithetic pairs.
 
     Attributes:
         value: the estimate, NaN if fewer than two independent samples were finite. It and the next two have the form of
             the parameters, with None in place of leaves that are no floating-point arrays.
         standard_error: standard error of each coordinate of `value`.
-        covariance_diagonal: variance of each coordinate, per rollout.
+        covariance_diagonal: variance of each coordinate, per rollout: the squared error times `num_finite`.
         objective_mean: mean cost under noise, an estimate of $F(\theta)$.
         objective_standard_error: standard error of `objective_mean`.
         num_samples: rollouts with noise that were asked for.
@@ -117,9 +116,8 @@ def assemble(
 ) -> GradientEstimate:
     """Assemble an estimate; its value is NaN where too few units were finite.
 
-    Moments and counts are over independent units: samples, or pairs of them. `count` is the number of finite units,
-    `num_felt` that of units whose noise made a difference, or cannot tell. `restore` maps a vector to the form of the
-    parameters, and `has_baseline` says whether the baseline is finite.
+    Moments and counts are over units: samples, or pairs of them. `count` is the number of finite units, `num_felt` that
+    of `Samples.num_felt`. `restore` maps a vector to the form of the parameters.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

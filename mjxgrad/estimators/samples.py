@@ -248,24 +248,16 @@ def stream(
 class Group(eqx.Module):
     """Samples differentiated by noise that are compared with each other.
 
-    Values that are not finite, or pad a chunk, are zero and masked. With random starts samples 2i and 2i + 1 share one.
+    Values that are not finite, or pad a chunk, are zero and masked by `has_cost` (and `has_derivative`).
 
     Attributes:
-        costs: costs minus `centre`.
-        derivatives: derivatives of the cost by the noise.
-        noise: noise of each sample.
-        scores: scores of the noise.
-        has_cost: whether a sample has a finite cost.
-        has_derivative: whether a sample has a finite cost and derivative.
-        stddev: standard deviation of each component of the noise.
-        centre: mean cost.
+        costs: costs minus their mean, the `centre`.
         rounding: largest magnitude of a cost, the scale of its rounding.
-        per_unit: 2 where pairs share a start, else 1.
+        per_unit: 2 where samples 2i and 2i + 1 share a start, else 1.
     """
 
     costs: Float[Array, "*groups samples"]
     derivatives: Float[Array, "*groups samples m"]
-    noise: Float[Array, "*groups samples m"]
     scores: Float[Array, "*groups samples m"]
     has_cost: Bool[Array, "*groups samples"]
     has_derivative: Bool[Array, "*groups samples"]
@@ -290,7 +282,6 @@ class Group(eqx.Module):
         return cls(
             costs=jnp.where(has_cost, (costs - origin) - offset, 0),
             derivatives=jnp.where(has_derivative[:, None], gradients, 0),
-            noise=scores * stddev**2,
             scores=scores,
             has_cost=has_cost,
             has_derivative=has_derivative,
@@ -299,6 +290,10 @@ class Group(eqx.Module):
             rounding=jnp.abs(costs).max(),
             per_unit=per_unit,
         )
+
+    @property
+    def noise(self) -> Float[Array, "samples m"]:
+        return self.scores * self.stddev**2
 
     def same_start(self) -> Bool[Array, "samples samples"]:
         """Return which pairs of samples differ only in their noise."""
@@ -332,7 +327,7 @@ class Group(eqx.Module):
             filled = jnp.pad(leaf, [(0, num_groups * size - count)] + [(0, 0)] * (leaf.ndim - 1))
             return filled.reshape(num_groups, size, *leaf.shape[1:])
 
-        own = ("costs", "derivatives", "noise", "scores", "has_cost", "has_derivative")
+        own = ("costs", "derivatives", "scores", "has_cost", "has_derivative")
         shared = ("stddev", "centre", "rounding")
         parts = {name: split(getattr(self, name)) for name in own}
         parts |= {n: jnp.broadcast_to(getattr(self, n), (num_groups, *getattr(self, n).shape)) for n in shared}

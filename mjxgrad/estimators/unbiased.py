@@ -6,9 +6,8 @@ $$\mathbb{E}[(f_j - \beta\, a\cdot w_j - b)\, s_j + \beta\, P_j^\top a] = \nabla
 
 for all $a$, $\beta$ and $b$ that do not depend on $w_j$. The reason: $(a\cdot w_j)s_j$ and $P_j^\top a$ have the same mean,
 where $P_j^\top$ is the pull-back from the noise to the parameters. Here $a$ is the mean derivative of the other samples. It
-removes the linear part of the cost, the source of most of the noise of a zeroth-order estimate. Where derivatives are wrong,
-$\beta$ is near zero and the zeroth-order estimate remains. $a$, $\beta$ and $b$ all leave sample j out, so no samples are
-set aside.
+removes the linear part of the cost, the source of most of the noise of a zeroth-order estimate. The share $\beta$, from 0 to
+1, is fitted by least squares: near zero where derivatives are wrong. $a$, $\beta$ and $b$ all leave sample j out.
 """
 
 import equinox as eqx
@@ -71,8 +70,7 @@ def _fitted_share(
 ) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
-    Up to fourth moments, the variance of the estimate is the variance of the remaining costs times that of the score. The
-    share therefore minimises both.
+    Up to fourth moments, the share that minimises the variance of the remaining costs minimises that of the estimate.
     """
     has_slope = samples.has_derivative.astype(slopes.dtype)
     count = has_slope.sum() - has_slope[:, None] - has_slope[None, :]
@@ -98,11 +96,10 @@ def _fitted_share(
 def _partner_prediction(
     samples: Group, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
 ) -> Float[Array, " samples"]:
-    """Return the best linear prediction of each remaining cost from its partner's, relative to the mean.
+    """Return the best linear prediction of each remaining cost from that of its partner, relative to the mean.
 
     The partner is the other sample from the same start. The prediction is its distance from the mean times the
-    correlation within the other pairs. Where starts cause most of the spread, the correlation is near one and the
-    baseline is the partner's cost.
+    correlation within the other pairs, near one where starts cause most of the spread.
     """
     both = others * _partner(others)
     covariance = (both * rest * _partner(rest)).sum(axis=1)

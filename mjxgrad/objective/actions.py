@@ -28,8 +28,8 @@ from mjxgrad.objective.task import Outcome, Task, as_pytree
 class ActionNoise(Objective):
     """The common part of open loop and closed loop.
 
-    The noise of a rollout is the noise of its actions, or the pair of action noise and start where the task has a
-    distribution of starts. The start does not depend on the parameters, so it adds nothing to the score.
+    The noise of a rollout is that of its actions, or the pair of it and a start where the task has a distribution of
+    starts. The start does not depend on the parameters, so it adds nothing to the score.
     """
 
     task: eqx.AbstractVar[Task]
@@ -111,8 +111,7 @@ class ActionNoise(Objective):
     def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
         """Differentiate by the action noise through the whole loop, in one reverse pass.
 
-        The total derivatives of the cost by the noise of an action and by the action itself are equal. The parameters
-        affect the cost only through the actions. The pull-back at the visited states therefore gives their whole gradient.
+        The parameters affect the cost only through the actions, so the pull-back of this derivative is their gradient.
         """
         actions, start = self.split(noise)
 
@@ -252,8 +251,7 @@ def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, 
 class _ActionsTranspose:
     """The transpose of the derivative of the mean actions by the parameters, at given states.
 
-    It is a class because equal settings must give equal pytrees, and two closures are never equal. It evaluates the policy
-    again because the residuals of `jax.vjp` would be a different pytree in each trace.
+    Equal settings must give equal pytrees, which two closures never are, nor the residuals of two traces of `jax.vjp`.
     """
 
     unravel: Callable[[Float[Array, " dim"]], PyTree]

@@ -1,8 +1,7 @@
-r"""The interface of an objective to estimators: a value under noise, and the score of the noise.
+r"""The interface of an objective to estimators: a draw of the noise, the value under it, and its score.
 
-Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. An estimator of $\nabla F$ needs only three functions: a draw of
-the noise, the value under it, and the score $s$. The score is the gradient of the log density of the noisy quantity by
-$\theta$; it satisfies $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
+Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. The score $s$ is the gradient of the log density of the noisy
+quantity by $\theta$; it satisfies $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
 """
 
 import dataclasses
@@ -25,13 +24,13 @@ MOST_FORWARD_DIMENSIONS = 3
 class Differentiated(eqx.Module):
     r"""One rollout, differentiated by the noisy quantity $a = \mu_\theta + w$ in place of the parameters.
 
-    `pull_back` is linear: the transpose of $\partial\mu_\theta/\partial\theta$ at the states of this rollout. Terms can
-    therefore be weighted, mixed or given baselines by noise component (by step and action), and pulled back once at the end:
+    `pull_back` is the transpose of $\partial\mu_\theta/\partial\theta$ at the states of this rollout. Terms can therefore be
+    weighted by noise component (by step and action), and pulled back once at the end:
 
         pull_back(gradient_by_noise) = ∇_θ f(θ, w)    the first-order gradient of this sample
         pull_back(noise_score) = s(θ, w)              the score of this sample
 
-    It is a pytree: a vmapped function may return it, and `jax.vmap(lambda pull, x: pull(x))` applies it to a batch.
+    It is a pytree: `jax.vmap(lambda pull, x: pull(x))` applies it to a batch.
 
     Attributes:
         cost: cost of the rollout, NaN if it diverged.
@@ -52,8 +51,8 @@ class Objective(eqx.Module):
     """A cost under noise, the input of estimators.
 
     A subclass gives `dim`, `sample_noise`, `value` and `score`. It overrides `value_and_score` if both come from one
-    rollout, and `mirror` and `zero_noise` if its noise is not symmetric about zero. It overrides `differentiate`,
-    `noise_shape` and `with_stddev` if its noise is Gaussian or not on the parameters.
+    rollout, `mirror` and `zero_noise` if its noise is not symmetric about zero, and `differentiate`, `noise_shape` and
+    `with_stddev` if it is Gaussian or not on the parameters.
     """
 
     dim: eqx.AbstractVar[int | None]
@@ -106,9 +105,8 @@ class Objective(eqx.Module):
         return (self.dim,)
 
     def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
-        """Roll out once and differentiate by the noisy quantity.
+        """Roll out once and differentiate by the noisy quantity; by default, by the parameters themselves.
 
-        The default takes the parameters as the noisy quantity: the derivative is by them, and the pull-back is the identity.
         Both identities of `Differentiated` then hold for any noise. Its standard deviation is not known, and NaN.
         """
         (cost, score), gradient = value_and_gradient(lambda at: self.value_and_score(at, noise), params, has_aux=True)
@@ -174,11 +172,7 @@ def as_scalar(value: Any, name: str) -> Float[Array, ""]:
 def value_and_gradient(
     function: Callable[[Float[Array, " dim"]], Any], point: Float[Array, " dim"], *, has_aux: bool = False
 ) -> tuple[Any, Float[Array, " dim"]]:
-    """Differentiate a scalar function of a vector, as `jax.value_and_grad` does, in the cheaper mode.
-
-    This is forward mode up to three dimensions, and reverse mode above or for functions without forward mode
-    (`jax.custom_vjp`).
-    """
+    """Differentiate as `jax.value_and_grad` does, in forward mode up to three dimensions if the function has one."""
 
     def scalar(at: Float[Array, " dim"]) -> Any:
         found = function(at)
