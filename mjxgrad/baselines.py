@@ -76,9 +76,7 @@ def cross_entropy(
     r"""Minimise a cost by the cross-entropy method.
 
     Every step draws candidates from $N(\mu, \mathrm{diag}\,\sigma^2)$ and fits $\mu$ and $\sigma$ to the `num_elite`
-    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$).
-    Candidates are rolled out without the objective's noise, from random starts where the task has them. Candidates that are
-    not finite are never elite. A step with fewer than `num_elite` finite ones is not taken.
+    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$). A step with fewer finite ones is not taken.
 
     Args:
         objective: the objective; only its cost is used.

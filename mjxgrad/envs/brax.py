@@ -1,4 +1,4 @@
-"""Any environment as a brax environment, for brax's learners: `ppo.train(BraxEnv(mg.envs.ant()), episode_length=1000, ...)`.
+"""Any environment as a brax environment, for brax's learners.
 
 Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier jax, or a
 substitute for this function.
@@ -17,7 +17,7 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """An environment for brax's wrappers: `train(BraxEnv(environment), environment.episode_length, ...)`.
+    """An environment for brax: `ppo.train(BraxEnv(environment), episode_length=environment.episode_length, ...)`.
 
     Brax's wrappers reset it and end it by the learner's episode length; `done` is only an end for good. If friction, masses
     and gains are random, each copy draws its own in `reset` and keeps them.

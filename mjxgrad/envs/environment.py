@@ -2,8 +2,7 @@
 
 `reset(key)` and `step(state, action)` are like those of brax and MuJoCo Playground: traceable, mapped over batches by
 `jax.vmap` and differentiated by `jax.grad`. Compile them as `jax.jit(lambda state, action: env.step(state, action))`, since
-`jax.jit(env.step)` would need a hash, which a pytree of arrays has not. Your own environment gives three or four methods and
-inherits the rest.
+`jax.jit(env.step)` would need a hash, which a pytree of arrays has not.
 """
 
 import dataclasses
@@ -206,8 +205,7 @@ class Environment(InScene):
     def refined(self, times: int) -> "Environment":
         """Return the environment with time steps shorter by a factor of `times`; an action lasts as long as before.
 
-        Where contact lasts few time steps, a policy's return depends on the time step as well as on the scene. With shorter
-        steps it depends on the scene alone.
+        Where contact lasts few time steps, a policy's return depends on the time step as well as on the scene.
 
         Raises:
             ValueError: if `times` is no whole number, or below 1.

@@ -59,18 +59,13 @@ class RunOptions(eqx.Module):
 
 
 class Carry(eqx.Module):
-    """The state of one run between two steps.
+    """The state of one run between two steps; see also `Optimisation`.
 
     Attributes:
-        params: parameters.
         state: the method's own state.
         key: key of the run; the noise of a step comes from it and the number of the step.
-        best: best parameters so far.
-        num_steps: steps done, those not taken included.
-        num_skipped: steps not taken.
         num_in_a_row: length of the present row of steps not taken.
         num_still: length of the present row of steps that felt nothing.
-        stopped: an item of `Stopped`.
     """
 
     params: Float[Array, " dim"]
@@ -137,12 +132,7 @@ class Descent(Method):
     ) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
         """Return the carry after a step, and the record of the step; nothing changes where a run has stopped.
 
-        Args:
-            carry: carry before the step.
-            index: number of the step.
-            params: parameters after the step; unchanged, with `record.is_taken` False, if it could not be taken.
-            state: state after the step; unchanged if it could not be taken.
-            record: record of the step.
+        `params` and `state` are those after the step; unchanged, with `record.is_taken` False, if it could not be taken.
         """
         options, at, nan = self.options, carry.params, jnp.full((), jnp.nan, carry.params.dtype)
         noise_free, candidate = nan, Best(at, record.cost, record.scale, record.finite_fraction)

@@ -41,8 +41,7 @@ def optimise(
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
 
     A step whose estimate is not finite is not taken: parameters and optimiser stay unchanged, `num_skipped` counts the
-    step, and the next one draws other noise. The run stops with `Stopped.nothing_felt` if for a few steps all samples cost
-    the same and no derivative differs from zero, for instance because a policy touches nothing.
+    step, and the next one draws other noise. The run stops where nothing is felt, see `Stopped`.
 
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` is the schedule of the scale.
@@ -146,8 +145,7 @@ class GradientStep(Descent):
     ) -> tuple[Float[Array, " dim"], PyTree, Bool[Array, ""]]:
         """Return the optimiser's change of the parameters, its state after, and whether the step is taken.
 
-        The gradient is the sum of the estimate and of the gradient of anything else in the cost. A step that would not
-        be finite is not taken: the change is zero and the state stays unchanged.
+        The gradient is the sum of the estimate and of the gradient of anything else in the cost.
         """
         is_finite = jnp.isfinite(gradient).all()
         # NaN must not reach the optimiser: its behaviour is then undefined, even if the result is discarded.
@@ -160,14 +158,11 @@ class GradientStep(Descent):
 
 
 class EstimatedGradientState(eqx.Module):
-    """The state of `estimated_gradient`.
+    """The state of `estimated_gradient`: counts of updates and of those that were not finite, and the optimiser's state.
 
     Attributes:
-        step: number of updates so far; the noise of an update comes from it.
-        num_skipped: number of updates that were not finite and therefore zero.
         scale: scale of the annealing at the last update.
         estimate: last estimate, as a vector; all NaN before the first update.
-        inner: state of the optimiser.
     """
 
     step: Int[Array, ""]
@@ -194,9 +189,8 @@ def estimated_gradient(
             params = optax.apply_updates(params, change)
         state.estimate  # the last one, with its error bars
 
-    Update number n draws its noise from `fold_in(key, n)`, as in `optimise`, so both give the same trajectory. The
-    arguments are those of `optimise`. With `optimiser` None the update is the gradient itself, to be chained with other
-    transformations.
+    Arguments and noise are those of `optimise`, so both give the same trajectory. With `optimiser` None the update is the
+    gradient itself, to be chained with other transformations.
 
     Returns:
         A transformation of a vector, or of a pytree as in `optimise`. The updates that it is given are added to the

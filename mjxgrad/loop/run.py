@@ -1,7 +1,6 @@
 """The loop that every method runs in: steps on the device in segments; logs and checkpoints between them.
 
-A method is two functions, from a start to a carry and from a carry to the next; the carry is any pytree. Descents (`descent`)
-are methods with a vector of parameters. Learning a policy is a method, too (`mjxgrad.learning`).
+A method is two functions, from a start to a carry and from a carry to the next; the carry is any pytree.
 """
 
 import functools
@@ -32,7 +31,7 @@ class Progress(NamedTuple):
     Attributes:
         carry: carry after the last step.
         found: records of the steps, in NumPy, with the steps on the first axis.
-        seconds: wall-clock time of each step. It is measured per segment and divided evenly among its steps.
+        seconds: wall-clock time of each step, without compilation, measured per segment and divided among its steps.
         compile_seconds: time of tracing and compilation in this session.
     """
 

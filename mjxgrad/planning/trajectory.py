@@ -158,10 +158,9 @@ def optimise_trajectory(
 ) -> Plan:
     """Improve controls by iterating on linear-quadratic models of the smoothed system (iLQR), with decreasing smoothing.
 
-    Each iteration linearises the system along its course under the present smoothing. It solves the linear-quadratic problem
-    within the control limits and takes the best of several step lengths, by the cost of the smoothed system under the next,
-    smaller smoothing. The cost of the system itself under the same controls is recorded, and the controls with the lowest such
-    cost are returned.
+    Each iteration linearises the system along its course and solves the linear-quadratic problem within the control limits.
+    It takes the best of several step lengths, by the cost under the next, smaller smoothing. The controls with the lowest
+    cost of the system itself are returned.
 
     Args:
         system: the system to be controlled.

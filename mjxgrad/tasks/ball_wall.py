@@ -1,7 +1,4 @@
-r"""A ball thrown at an angle over a wall: cleared or blocked.
-
-First-order and zeroth-order gradients differ in this example, with real contact in place of a formula. The cost is the
-squared distance between the ball's end and a target behind the wall, a function of the angle alone.
+r"""A ball thrown at an angle over a wall: cleared or blocked. First-order and zeroth-order gradients differ here.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
