@@ -36,6 +36,11 @@ class _Adapter:
         self.render_mode, self._view = render_mode, view
         self.metadata = {**_METADATA, "render_fps": round(1 / float(self.environment.interval))}
 
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
+        super().reset(seed=seed, options=options)
+        self._copy_key, self._state = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
+        return np.asarray(self._state.obs), self._info(self._state)
+
     def _spaces(self) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
         obs = jax.eval_shape(self.environment.reset, jax.random.key(0)).obs
         seen = gymnasium.spaces.Box(-np.inf, np.inf, obs.shape, obs.dtype)
@@ -71,18 +76,17 @@ class GymEnv(_Adapter, gymnasium.Env):
         self._begin = jax.jit(lambda key: self.environment.begin(key))
         self._advance = jax.jit(lambda key, state, action: self.environment.randomised(key).step(state, action))
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
-        super().reset(seed=seed, options=options)
-        self._copy_key, self._state = self._begin(_key(self.np_random))
-        return np.asarray(self._state.obs), _info(self._state)
-
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, _Info]:
         state = self._state = self._advance(self._copy_key, self._state, jnp.asarray(action))
-        return np.asarray(state.obs), float(state.reward), bool(state.terminated), bool(state.truncated), _info(state)
+        ends = bool(state.terminated), bool(state.truncated)
+        return np.asarray(state.obs), float(state.reward), *ends, self._info(state)
 
     def render(self) -> np.ndarray | None:
         """Draw the present state, in the render mode "rgb_array"."""
         return None if self.render_mode is None else self._drawn(self._state.physics.qpos[None])[0]
+
+    def _info(self, state: EnvState) -> _Info:
+        return {name: float(value) for name, value in state.metrics.items()}
 
 
 class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
@@ -111,13 +115,8 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         self._begin = jax.jit(lambda key: jax.vmap(self.environment.begin)(jax.random.split(key, num_envs)))
         self._advance = jax.jit(jax.vmap(advance))
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
-        super().reset(seed=seed, options=options)
-        self._copy_keys, self._state = self._begin(_key(self.np_random))
-        return np.asarray(self._state.obs), self._info(self._state)
-
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Info]:
-        ended, self._state = self._advance(self._copy_keys, self._state, jnp.asarray(actions))
+        ended, self._state = self._advance(self._copy_key, self._state, jnp.asarray(actions))
         done = np.asarray(ended.done)
         infos = {**self._ends(ended, done), **self._info(self._state)}
         outcome = (np.asarray(x) for x in (self._state.obs, ended.reward, ended.terminated, ended.truncated))
@@ -145,14 +144,6 @@ def gym_name(name: str) -> str:
     """Return gymnasium's name of one of `ENVIRONMENTS`: `diffrl_ant` is `mjxgrad/DiffRLAnt-v0`."""
     words = ["DiffRL" if word == "diffrl" else word.capitalize() for word in name.split("_")]
     return f"mjxgrad/{''.join(words)}-v0"
-
-
-def _key(generator: np.random.Generator) -> PRNGKeyArray:
-    return jax.random.key(int(generator.integers(2**31)))
-
-
-def _info(state: EnvState) -> _Info:
-    return {name: float(value) for name, value in state.metrics.items()}
 
 
 for _name in ENVIRONMENTS:

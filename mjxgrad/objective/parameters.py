@@ -48,14 +48,12 @@ class ParameterNoise(Objective):
         return Differentiated(cost, gradient, self.score(params, noise), stddev, Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ParameterNoise":
-        stddev, dim = _fitting(stddev, self.dim)
-        return dataclasses.replace(self, stddev=stddev, dim=dim)
+        new = parameter_noise(self.function, stddev, self.dim)
+        return dataclasses.replace(self, stddev=new.stddev, dim=new.dim)
 
 
 def parameter_noise(
-    function: Callable[[Any], Float[Array, ""]],
-    stddev: float | Float[Array, ""] | Float[Array, " dim"],
-    dim: int | None = None,
+    function: Callable[[Any], Float[Array, ""]], stddev: float | Float[Array, "*dim"], dim: int | None = None
 ) -> ParameterNoise:
     r"""Smooth any function of parameters by Gaussian noise on them.
 
@@ -72,8 +70,10 @@ def parameter_noise(
     Raises:
         ValueError: if `stddev` is not positive, or neither one number nor `dim` of them.
     """
-    stddev, dim = _fitting(stddev, dim)
-    return ParameterNoise(function=as_pytree(function), stddev=stddev, dim=dim)
+    width = positive(stddev)
+    if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
+        raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
+    return ParameterNoise(as_pytree(function), width, width.shape[0] if width.ndim == 1 else dim)
 
 
 class Restored(eqx.Module):
@@ -130,11 +130,3 @@ def as_vector(
     if restore is None:
         return objective, vector, unchanged
     return objective, vector, lambda gradient: eqx.filter(restore(gradient), eqx.is_inexact_array)
-
-
-def _fitting(stddev: float | Float[Array, "..."], dim: int | None) -> tuple[Float[Array, "*dim"], int | None]:
-    """Return the standard deviation as an array, and the number of parameters, `dim` or its length."""
-    stddev = positive(stddev)
-    if stddev.ndim > 1 or (stddev.ndim == 1 and dim not in (None, stddev.shape[0])):
-        raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {stddev.shape}")
-    return stddev, stddev.shape[0] if stddev.ndim == 1 else dim
