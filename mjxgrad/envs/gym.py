@@ -147,5 +147,9 @@ def gym_name(name: str) -> str:
 
 
 for _name in ENVIRONMENTS:
-    _entry_points = {"entry_point": f"{__name__}:GymEnv", "vector_entry_point": f"{__name__}:GymVectorEnv"}
-    gymnasium.register(gym_name(_name), **_entry_points, kwargs={"environment": _name})
+    gymnasium.register(
+        gym_name(_name),
+        entry_point=f"{__name__}:{GymEnv.__name__}",
+        vector_entry_point=f"{__name__}:{GymVectorEnv.__name__}",
+        kwargs={"environment": _name},
+    )

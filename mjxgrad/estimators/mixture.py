@@ -1,6 +1,7 @@
 """Mixtures of a first-order and an unbiased estimate from the same rollouts, and the evidence that weighs them."""
 
 import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

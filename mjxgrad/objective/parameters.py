@@ -73,7 +73,8 @@ def parameter_noise(
     width = positive(stddev)
     if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
-    return ParameterNoise(as_pytree(function), width, width.shape[0] if width.ndim == 1 else dim)
+    dim = width.shape[0] if width.ndim == 1 else dim
+    return ParameterNoise(function=as_pytree(function), stddev=width, dim=dim)
 
 
 class Restored(eqx.Module):
