@@ -1,9 +1,8 @@
 r"""Search without derivatives in the same loop, with rollouts counted alike.
 
 A search draws candidates $\theta_i = \mu + \sigma \epsilon_i$ around the present point $\mu$ and moves it by its own
-rule. The search noise replaces the objective's noise: candidates are rolled out without it, or, where a task's
-start is random, each with its own start. The cost in the history is the mean over the candidates. The best
-parameters are among the points $\mu$, whose noise-free cost `evaluate` measures.
+rule. Candidates are rolled out without the objective's noise, but from random starts where the task has them. The cost in
+the history is the mean over the candidates. The best parameters are among the points $\mu$.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
 from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective, OpenLoop, ParameterNoise
-from mjxgrad.objective.base import as_objective
+from mjxgrad.objective.base import as_objective, positive
 
 __all__ = ["Population", "cross_entropy"]
 
@@ -118,20 +117,17 @@ def search_stddev(
     as_objective(objective)
     whole("num_samples", num_samples, 2)
     dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1
-    if stddev is None and isinstance(objective, OpenLoop):
-        return jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape))
-    if stddev is None and isinstance(objective, ParameterNoise):
-        return jnp.broadcast_to(objective.stddev, (dim,))
+    if stddev is None and isinstance(objective, OpenLoop | ParameterNoise):
+        shape = objective.noise_shape if isinstance(objective, OpenLoop) else (dim,)
+        return jnp.ravel(jnp.broadcast_to(objective.stddev, shape))
     if stddev is None:
         raise ValueError(
             f"stddev must be given for {type(objective).__name__}, whose noise is not on the parameters; "
             "it is the width of the search, in the parameters' units"
         )
-    width = jnp.asarray(stddev, float)
+    width = positive(jnp.asarray(stddev, float))
     if width.shape not in ((), (dim,)):
         raise ValueError(f"stddev must be one number or {dim}, got shape {width.shape}")
-    if not bool((width > 0).all()):
-        raise ValueError(f"stddev must be positive, got {stddev}")
     return jnp.broadcast_to(width, (dim,))
 
 

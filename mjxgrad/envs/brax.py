@@ -19,8 +19,8 @@ except ImportError as error:
 class BraxEnv(Env):
     """An environment for brax: `ppo.train(BraxEnv(environment), episode_length=environment.episode_length, ...)`.
 
-    Brax's wrappers reset it and end it by the learner's episode length; `done` is only an end for good. If friction, masses
-    and gains are random, each copy draws its own in `reset` and keeps them.
+    Brax's wrappers reset it and end it by the learner's episode length; `done` is only an end for good. Each copy draws what
+    is random in `reset` and keeps it.
     """
 
     def __init__(self, environment: Environment):

@@ -1,8 +1,7 @@
 r"""The tasks on which SHAC and its successors are compared: ant, hopper, cheetah, humanoid and a cart-pole swing-up.
 
-Observations, rewards and ends are DiffRL's, and so are all starts but the cart-pole's. The bodies are gymnasium's, and contact
-is MuJoCo's. Returns are comparable within this project, but with published ones only as ratios. An action holds for 1/60 s, and
-an episode has 1000 actions (cart-pole 240).
+Observations, rewards, ends and all starts but the cart-pole's are DiffRL's, bodies gymnasium's. Contact is MuJoCo's, so
+returns compare with published ones only as ratios. An action holds for 1/60 s, and an episode has 1000 (cart-pole 240).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.

@@ -53,10 +53,7 @@ class _Adapter:
 
 
 class GymEnv(_Adapter, gymnasium.Env):
-    """One copy of an environment. `reset` draws its friction, masses and gains anew, if they are random.
-
-    The environment's own `episode_length` is the only limit of steps.
-    """
+    """One copy of an environment, limited by its `episode_length`; `reset` draws what is random in it anew."""
 
     metadata = _METADATA
 
@@ -90,7 +87,7 @@ class GymEnv(_Adapter, gymnasium.Env):
 
 
 class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
-    """Many copies of an environment in one program, each with its own friction, masses and gains, if they are random.
+    """Many copies of an environment in one program, each with its own draw of what is random.
 
     A copy whose episode ends starts the next one in the same step: the observation is already the new one. `final_obs` and
     `final_info` hold the last ones of the old episode.

@@ -93,9 +93,8 @@ def first_and_zeroth_order(
 ) -> tuple[GradientEstimate, GradientEstimate]:
     """Estimate the gradient in first and in zeroth order from the same differentiated rollouts.
 
-    Arguments and errors are those of `zeroth_order`, and so are the estimates of both functions from the same key. The two
-    are dependent, and each reports the rollouts spent on both: do not add them. A sample with a finite cost but no finite
-    derivative counts in the second only.
+    Arguments, errors and estimates are those of both functions. The two are dependent, and each reports the rollouts spent
+    on both: do not add them. A sample with a finite cost but no finite derivative counts in the second only.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)

@@ -1,7 +1,7 @@
 """Rollouts under noise, in chunks, with memory independent of their number.
 
-A rollout is differentiated by the parameters, or by its noise for estimators that compare derivatives with costs. Both ways
-are needed: a long rollout with few parameters is differentiated in forward mode, which the noise of all its actions forbids.
+A rollout is differentiated by its noise for estimators that compare derivatives with costs, else by the parameters: few of
+them allow forward mode.
 """
 
 import dataclasses
@@ -30,9 +30,7 @@ GROUP_SIZE = 64
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The rollouts that an estimator asks for.
-
-    A unit is one sample or one pair of samples, independent of all other units.
+    """The rollouts that an estimator asks for; a unit is one sample or one pair, independent of all other units.
 
     Attributes:
         num_samples: number of rollouts with noise.
@@ -171,10 +169,9 @@ class Samples(eqx.Module):
 def sample(
     objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, plan: Plan, units: Int[Array, " units"]
 ) -> Samples:
-    """Roll out some units of a plan under one `jax.vmap`.
+    """Roll out some units of a plan under one `jax.vmap`, the unit `plan.num_units` without noise.
 
-    The noise of unit i comes from `fold_in(key, i)`, so it does not depend on the chunk. The index `plan.num_units` is
-    the rollout without noise. It is part of the batch so that the rollout is compiled only once.
+    The noise of unit i comes from `fold_in(key, i)`, so it does not depend on the chunk.
     """
     one_key(key)
     is_noise_free = (units == plan.num_units) & plan.with_zero_noise

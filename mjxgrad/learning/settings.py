@@ -1,4 +1,4 @@
-"""Settings for learning from short windows; the defaults are SHAC's."""
+"""Settings for learning from short windows."""
 
 import dataclasses
 
@@ -13,8 +13,8 @@ class Settings:
         num_environments: number of environments side by side.
         window: steps of each environment per update.
         discount: discount per step.
-        rule: map from the evidence of a step and action to the weight of its first-order gradient. It is asked for each of
-            them. A failure probability of a twentieth would bring in much noise, so the default is smaller.
+        rule: map from the evidence of a step and action to the weight of its first-order gradient. Many are asked, so the
+            default's failure probability is small.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
         actor_layers: hidden sizes of the policy.
         actor_scale: factor of the initial gains of the policy's hidden layers.

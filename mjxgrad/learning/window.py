@@ -76,8 +76,7 @@ class Gradients(eqx.Module):
         """Return first-order gradients of at most `most` zeroth-order root mean squares, and which were shortened.
 
         Through contact a few gradients are a million times longer than the others and dominate the mean of any batch.
-        Gradients as long as zeroth-order noise are no more informative than it. Shortening adds a small bias, which the rules
-        can see.
+        Shortening adds a small bias, which the rules can see.
         """
         norms = jnp.linalg.norm(self.first, axis=-1)
         limit = most * jnp.sqrt((self.zeroth**2).sum(axis=-1).mean(axis=0))
@@ -176,13 +175,10 @@ def window_gradients(
 
 
 def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments steps nu"], Weights, Evidence]:
-    """Mix both gradients by step and action.
+    """Return the mixture of both gradients by step and action, the rule's weights, and the evidence for them.
 
-    Where a first-order gradient is not finite, the zeroth-order one replaces it. The rule maps the evidence of a step and
-    action to its weight. Costs are not compared (`inconsistency` is zero), since no two environments share a start.
-
-    Returns:
-        The mixture, the weights by step and action, and their evidence.
+    Where a first-order gradient is not finite, the zeroth-order one replaces it. Costs are not compared (`inconsistency` is
+    zero), since no two environments share a start.
     """
 
     def found(first: Array, zeroth: Array, is_finite: Array) -> Evidence:

@@ -88,10 +88,7 @@ class Restored(eqx.Module):
 
 
 def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return the floating-point arrays of a pytree as a vector, with its inverse; or an array unchanged, with None.
-
-    The inverse also takes one vector per seed.
-    """
+    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; or an array, None."""
     if eqx.is_array_like(params):
         return jnp.asarray(params), None
     # `is_inexact_array_like` calls a tracer's `__jax_array__`, which is None (jax 0.10.2, equinox 0.13.8).
@@ -122,10 +119,7 @@ def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] 
 def as_vector(
     objective: Objective, params: PyTree
 ) -> tuple[Objective, Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
-    """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form.
-
-    The latter has None in place of leaves that are no floating-point arrays.
-    """
+    """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form."""
     vector, restore = flattened(params)
     objective = of_vector(as_objective(objective), restore).sized_for(vector)
     if restore is None:

@@ -35,8 +35,7 @@ class Outcome(eqx.Module):
 class Task(eqx.Module):
     """A map from controls to a cost; its dynamics need not be MuJoCo's.
 
-    A subclass gives `horizon`, `num_controls` and `run`. If rollouts may start in different states it also gives
-    `nominal_start`, and if the start is random `sample_start`.
+    A subclass gives `horizon`, `num_controls` and `run`; with random starts also `nominal_start` and `sample_start`.
     """
 
     horizon: eqx.AbstractVar[int]
@@ -86,8 +85,7 @@ class InScene(eqx.Module):
 
     Attributes:
         scene: the scene, from `load_scene`.
-        contact: how contact is stepped, see `rollout`; by default with the derivative that descents need, the slope of the
-            outcome. A sweep over its lengths is one `jax.vmap`.
+        contact: how contact is stepped, see `rollout`; by default with the derivative that descents need, the slope.
     """
 
     scene: Scene

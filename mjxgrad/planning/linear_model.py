@@ -275,7 +275,7 @@ def _model(
     change: ChangeVector,
     exists: Bool[Array, ""],
 ) -> LinearModel:
-    """Return the linear model from a Jacobian by state and control; all NaN if too few samples were finite."""
+    """Return the linear model from a Jacobian by state and control; all NaN if it does not exist."""
     jacobian, change = (jnp.where(exists, x, jnp.nan) for x in (jacobian, change))
     A, B = jnp.split(jacobian, [system.num_changes], axis=1)
     return LinearModel(A, B, system.retract(nominal, change))

@@ -1,7 +1,6 @@
 """Systems and costs for planning: a map from a state and a control to the next state, and the cost of a plan.
 
-A state is one flat vector. A change of it has the coordinates of the tangent space, fewer than the state's for quaternions.
-Code that linearises, samples or plans moves states by `retract` and compares them by `difference`, for any coordinates.
+A state is one flat vector. A change of it has the coordinates of the tangent space: `retract` and `difference` convert.
 """
 
 import dataclasses
@@ -82,11 +81,7 @@ class System(eqx.Module):
 
 
 class FunctionSystem(System):
-    """A function of two vectors as a system.
-
-    Attributes:
-        function: function from state and control to the next state.
-    """
+    """A function from state and control to the next state as a system."""
 
     function: Callable[[ChangeVector, ControlVector], ChangeVector] = eqx.field(converter=as_pytree)
     num_changes: int = eqx.field(static=True)

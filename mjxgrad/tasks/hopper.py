@@ -1,7 +1,7 @@
 """Gymnasium's hopper, dropped onto its foot under a linear policy that holds a posture.
 
-Nothing in it jumps, and yet its policy gradient is the hardest case of the discrete derivative. The impedance is not zero at
-first touch, so the derivative is wrong for every parameter that shifts the time of landing.
+Nothing in it jumps, yet the discrete derivative is wrong for every parameter that shifts the time of landing: the impedance
+is not zero at first touch.
 """
 
 import equinox as eqx
