@@ -132,10 +132,7 @@ def search_stddev(
 
 
 def _record(
-    costs: Float[Array, " num_samples"],
-    is_finite: Bool[Array, " num_samples"],
-    step_norm: Float[Array, ""],
-    is_taken: Bool[Array, ""],
+    costs: Float[Array, " n"], is_finite: Bool[Array, " n"], step_norm: Float[Array, ""], is_taken: Bool[Array, ""]
 ) -> Record:
     found = Moments.of(costs, is_finite)
     return dataclasses.replace(

@@ -35,7 +35,7 @@ from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, sample
-from mjxgrad.objective import Objective, ParameterNoise
+from mjxgrad.objective import Differentiated, Objective, ParameterNoise
 from mjxgrad.objective.base import unchanged
 from mjxgrad.scene import SceneWarning
 
@@ -427,10 +427,12 @@ def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNG
 def _by_parameters(samples: Samples) -> Samples:
     """Apply the chain rule from the noise to the parameters, for the gradient and score of each unit and rollout."""
     vjp = jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x)))
-    gradients, scores = (vjp(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
-    # These standard deviations belong to the noise; the parameters have none.
-    known = {"gradients": gradients, "scores": scores, "stddevs": jnp.full_like(scores, jnp.nan)}
-    return dataclasses.replace(samples, **known, pull_backs=Partial(unchanged))
+    found = samples.rollouts
+    gradients, scores = (vjp(found.pull_back, x) for x in (found.gradient_by_noise, found.noise_score))
+    # The standard deviations belong to the noise; the parameters have none.
+    unknown = jnp.full_like(scores, jnp.nan)
+    rollouts = Differentiated(found.cost, gradients, scores, unknown, Partial(unchanged))
+    return dataclasses.replace(samples, rollouts=rollouts)
 
 
 def _in_batches(
@@ -486,14 +488,17 @@ def _variance_intervals(
 ) -> Float[np.ndarray, "estimates 2 points"]:
     """Bootstrap the variance per rollout of each estimate at each point; axes: estimate, interval end, point."""
     intervals = []
-    for i in range(len(samples.costs)):
+    for i in range(len(samples.is_noisy)):
         one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples)
         is_noisy = one.is_noisy > 0
-        costs, scores = one.costs[is_noisy, 0], one.scores[is_noisy, 0]
+        costs, scores = one.rollouts.cost[is_noisy, 0], one.rollouts.noise_score[is_noisy, 0]
         is_finite = np.isfinite(costs)
         # Leaving one out is replaced by the mean, equal up to 1/N.
         centre = costs[is_finite].mean() if is_finite.any() else np.nan
-        terms = [np.where(is_finite[:, None], one.gradients[is_noisy, 0], np.nan), (costs - centre)[:, None] * scores]
+        terms = [
+            np.where(is_finite[:, None], one.rollouts.gradient_by_noise[is_noisy, 0], np.nan),
+            (costs - centre)[:, None] * scores,
+        ]
         terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
         intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.bodies.spatial import exponential, multiply, rotation_matrix
-from mjxgrad.envs.environment import Environment
+from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.action_task import robot_scene, scene_path
@@ -60,9 +60,7 @@ class Walker(Environment):
         course = jnp.stack([upright, heading])
         return jnp.concatenate([base, state.qvel[:6], joints, 0.1 * state.qvel[6:], course, memory["action"]])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Memory) -> Rewards:
         upright, heading = _posture(after)
         height = after.qpos[2] - self.fallen
         rise = height if self.rise_scale is None else _rise(height - 0.1, self.rise_scale, 0.1)
@@ -94,9 +92,7 @@ class Planar(Environment):
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
         return jnp.concatenate([state.qpos[1:], state.qvel])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         terms = {"forward": after.qvel[0], "action": -0.1 * (action**2).sum()}
         if self.fallen is None:
             return terms
@@ -125,9 +121,7 @@ class CartPole(Environment):
         (place, angle), (speed, rate) = state.qpos, state.qvel
         return jnp.stack([place, speed, jnp.sin(angle), jnp.cos(angle), rate])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         (place, angle), (speed, rate) = after.qpos, after.qvel
         upward = jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
         return {"pole": -(upward**2) - 0.1 * rate**2, "cart": -0.05 * place**2 - 0.1 * speed**2}

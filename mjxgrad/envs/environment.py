@@ -20,6 +20,7 @@ from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
+Rewards = dict[str, Float[Array, ""]]
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """A function from a key and a scene to a scene with other friction, masses or gains, by `scene.with_model`."""
 
@@ -84,9 +85,7 @@ class Environment(InScene):
         """Return the observation of the policy."""
 
     @abstractmethod
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         """Return the terms of the reward of one step; the reward is their sum.
 
         Args:

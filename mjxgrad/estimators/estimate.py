@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan
+from mjxgrad.objective.base import Scalar, Vector
 
 
 class Diagnosis(eqx.Enumeration):
@@ -63,16 +64,16 @@ class GradientEstimate(eqx.Module):
     value: PyTree[Float[Array, "..."]]
     standard_error: PyTree[Float[Array, "..."]]
     covariance_diagonal: PyTree[Float[Array, "..."]]
-    objective_mean: Float[Array, ""]
-    objective_standard_error: Float[Array, ""]
+    objective_mean: Scalar
+    objective_standard_error: Scalar
     num_samples: Int[Array, ""]
     num_finite: Int[Array, ""]
     num_rollouts: Int[Array, ""]
     num_gradient_rollouts: Int[Array, ""]
     diagnosis: Diagnosis
-    alpha: Float[Array, ""]
+    alpha: Scalar
     reason: Reason
-    bias_bound: Float[Array, ""]
+    bias_bound: Scalar
 
     @property
     def variance(self) -> Float[Array, "*batch"]:
@@ -101,14 +102,14 @@ def is_nothing_felt(plan: Plan, costs: Moments, num_felt: Int[Array, ""]) -> Boo
 
 
 def assemble(
-    value: Float[Array, " dim"],
-    squared_error: Float[Array, " dim"],
+    value: Vector,
+    squared_error: Vector,
     costs: Moments,
     plan: Plan,
     *,
     count: Int[Array, ""],
     num_felt: Int[Array, ""],
-    restore: Callable[[Float[Array, " dim"]], PyTree],
+    restore: Callable[[Vector], PyTree],
     has_baseline: Bool[Array, ""] | bool = True,
     alpha: ArrayLike = 0.0,
     reason: Any = Reason.fixed,
@@ -116,8 +117,8 @@ def assemble(
 ) -> GradientEstimate:
     """Assemble an estimate; its value is NaN where too few units were finite.
 
-    Moments and counts are over units: samples, or pairs of them. `count` is the number of finite units, `num_felt` that
-    of `Samples.num_felt`. `restore` maps a vector to the form of the parameters.
+    Moments and counts are over units: samples, or pairs of them. `count` is the number of finite units; see also
+    `Samples.num_felt`. `restore` maps a vector to the form of the parameters.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, ScoreMoments, as_real
 from mjxgrad.estimators.samples import Plan, Samples, plan_for_baseline, stream
 from mjxgrad.objective import Objective, as_vector
+from mjxgrad.objective.base import Vector
 
 
 def first_order(
@@ -104,8 +105,9 @@ def first_and_zeroth_order(
 def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Array]:
     """Return the moments of gradients and of costs, and the number of units that felt their noise."""
     mask = samples.first_order_mask()
-    gradients = Moments.of(samples.gradients.mean(axis=1), mask)
-    return gradients, Moments.of(samples.costs.mean(axis=1), mask), samples.num_felt()
+    rollouts = samples.rollouts
+    gradients = Moments.of(rollouts.gradient_by_noise.mean(axis=1), mask)
+    return gradients, Moments.of(rollouts.cost.mean(axis=1), mask), samples.num_felt()
 
 
 def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) -> GradientEstimate:
@@ -127,8 +129,9 @@ def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) 
 def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Array, Array]:
     """Return joint moments of costs and scores, moments of the costs, the cost without noise, and units that felt it."""
     mask = samples.zeroth_order_mask()
-    moments = ScoreMoments.of(samples.costs - samples.zero_noise_costs[:, None], samples.scores, mask)
-    return moments, Moments.of(samples.costs.mean(axis=1), mask), samples.noise_free_cost(), samples.num_felt()
+    costs, scores = samples.rollouts.cost, samples.rollouts.noise_score
+    moments = ScoreMoments.of(costs - samples.zero_noise_costs[:, None], scores, mask)
+    return moments, Moments.of(costs.mean(axis=1), mask), samples.noise_free_cost(), samples.num_felt()
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, restore: Callable) -> GradientEstimate:
@@ -165,7 +168,7 @@ def both_results(
     return first_order_result(summary[0], plan, restore), zeroth_order_result(summary[1], plan, baseline, restore)
 
 
-def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+def _leave_one_out(moments: ScoreMoments) -> tuple[Vector, Vector]:
     r"""Return the mean of $g_i = u_i - b_i \bar s_i$ and its squared error; $b_i$ is the mean cost of the other units.
 
     About the mean cost, $g_i = u_i + p_i/(n-1)$ with the features of `ScoreMoments`. Without pairs $u = p$, and this is
@@ -192,9 +195,7 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     return value, spread + (covariance**2 - covariance_spread) / (others**2 + 1)
 
 
-def _mean_and_squared_error(
-    total: Float[Array, " dim"], total_square: Float[Array, " dim"], count: Array
-) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+def _mean_and_squared_error(total: Vector, total_square: Vector, count: Array) -> tuple[Vector, Vector]:
     count = as_real(count, total)
     mean = total / jnp.maximum(count, 1)
     return mean, (total_square - count * mean**2) / jnp.maximum(count * (count - 1), 1)

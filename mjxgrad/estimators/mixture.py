@@ -14,6 +14,7 @@ from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Wei
 from mjxgrad.estimators.samples import Group, Plan, Samples, plan_by_noise, stream
 from mjxgrad.estimators.unbiased import UnbiasedTerms, gram, unbiased_terms
 from mjxgrad.objective import Objective, as_vector
+from mjxgrad.objective.base import Scalar, Vector
 
 
 def alpha_order(
@@ -105,10 +106,10 @@ class Parts(eqx.Module):
     costs: Moments
     scaled: Moments
     secants: SecantSums
-    linear_variance: Float[Array, ""]
-    beta: Float[Array, ""]
-    num_costs: Float[Array, ""]
-    num_groups: Float[Array, ""]
+    linear_variance: Scalar
+    beta: Scalar
+    num_costs: Scalar
+    num_groups: Scalar
     num_felt: Int[Array, ""]
 
     def evidence(self) -> Evidence:
@@ -126,7 +127,7 @@ class Parts(eqx.Module):
             scaled_first_norm=norm(self.scaled.mean),
         )
 
-    def mixture(self, alpha: Float[Array, "..."]) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+    def mixture(self, alpha: Float[Array, "..."]) -> tuple[Vector, Vector]:
         """Return the weighted mean and its squared error; without finite derivatives, those of the unbiased part."""
         has_first = self.first.count >= 2
         first = jnp.where(has_first, self.first.mean, 0)
@@ -138,7 +139,7 @@ class Parts(eqx.Module):
         mixed = alpha**2 * first_error + (1 - alpha) ** 2 * unbiased_error + 2 * alpha * (1 - alpha) * covariance
         return value, jnp.where(has_first, mixed, unbiased_error)
 
-    def _unbiased_squared_error(self, first: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    def _unbiased_squared_error(self, first: Vector) -> Vector:
         """Return the squared error of terms that share their baseline; derived at `first_and_zeroth._leave_one_out`.
 
         Its c, the covariance of cost and score, is here the covariance of the remaining cost and the score.

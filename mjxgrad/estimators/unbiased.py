@@ -17,6 +17,8 @@ from jaxtyping import Array, Float
 
 from mjxgrad.estimators.samples import Group
 
+_Pairs = Float[Array, "samples samples"]
+
 
 class UnbiasedTerms(eqx.Module):
     r"""The terms of a group, whose mean after the pull-back is the estimate.
@@ -32,12 +34,12 @@ class UnbiasedTerms(eqx.Module):
     linear_variance: Float[Array, ""]
 
 
-def gram(samples: Group) -> Float[Array, "samples samples"]:
+def gram(samples: Group) -> _Pairs:
     """Return the slope of sample i along the noise of sample k, from which all comparisons follow."""
     return jnp.matmul(samples.derivatives, samples.noise.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, with_derivatives: bool) -> UnbiasedTerms:
+def unbiased_terms(samples: Group, slopes: _Pairs, *, with_derivatives: bool) -> UnbiasedTerms:
     """Return the terms of a group; without derivatives, the terms of the zeroth-order estimate.
 
     Terms of samples without a cost are meaningless; the pull-back masks them.
@@ -65,9 +67,7 @@ def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, w
     return UnbiasedTerms(by_noise, beta, linear_variance)
 
 
-def _fitted_share(
-    samples: Group, slopes: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
-) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
+def _fitted_share(samples: Group, slopes: _Pairs, others: _Pairs) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
     Up to fourth moments, the share that minimises the variance of the remaining costs minimises that of the estimate.
@@ -77,7 +77,7 @@ def _fitted_share(
     along = (slopes.sum(axis=0)[None, :] - slopes - jnp.diagonal(slopes)[None, :]) / jnp.maximum(count, 1)
     weights = others * (count >= 1)
 
-    def centred(values: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+    def centred(values: _Pairs) -> _Pairs:
         if samples.per_unit == 2:  # the difference within a pair is free of the effect of the start
             return pairs * (values - _partner(values)) / jnp.sqrt(2.0)
         mean = (weights * values).sum(axis=1) / jnp.maximum(weights.sum(axis=1), 1)
@@ -93,9 +93,7 @@ def _fitted_share(
     return jnp.where(has_any, jnp.clip(share, 0, 1), 0), variance
 
 
-def _partner_prediction(
-    samples: Group, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
-) -> Float[Array, " samples"]:
+def _partner_prediction(samples: Group, rest: _Pairs, others: _Pairs) -> Float[Array, " samples"]:
     """Return the best linear prediction of each remaining cost from that of its partner, relative to the mean.
 
     The partner is the other sample from the same start. The prediction is its distance from the mean times the
@@ -111,6 +109,6 @@ def _partner_prediction(
     return jnp.where(has_partner, correlation * rest[index, partner], 0)
 
 
-def _partner(rows: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+def _partner(rows: _Pairs) -> _Pairs:
     """Return the rows with the two samples of each start swapped."""
     return rows.reshape(len(rows), -1, 2)[:, :, ::-1].reshape(rows.shape)

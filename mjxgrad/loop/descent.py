@@ -18,6 +18,7 @@ from mjxgrad._programs import compile_once
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
 from mjxgrad.loop.run import Log, Method, Progress, mean
+from mjxgrad.objective.base import Scalar, Vector
 
 # Progress is shown every five per cent; each time costs one return from the device.
 NUM_SEGMENTS = 20
@@ -44,7 +45,7 @@ class RunOptions(eqx.Module):
     """
 
     num_steps: int
-    evaluate: Callable[[Float[Array, " dim"]], Float[Array, ""]] | None = None
+    evaluate: Callable[[Vector], Scalar] | None = None
     evaluate_every: int = 10
     patience: int = 10
     log: Log | None = None
@@ -68,7 +69,7 @@ class Carry(eqx.Module):
         num_still: length of the present row of steps that felt nothing.
     """
 
-    params: Float[Array, " dim"]
+    params: Vector
     state: PyTree
     key: PRNGKeyArray
     best: Best
@@ -85,7 +86,7 @@ class Descent(Method):
     options: RunOptions
 
     @abstractmethod
-    def init_state(self, params: Float[Array, " dim"]) -> PyTree:
+    def init_state(self, params: Vector) -> PyTree:
         """Return the first state of the method, carried from step to step beside the parameters."""
 
     def begun(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> dict[str, Any]:
@@ -120,7 +121,7 @@ class Descent(Method):
             **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint")},
         }
 
-    def init(self, start: tuple[Float[Array, " dim"], PRNGKeyArray]) -> Carry:
+    def init(self, start: tuple[Vector, PRNGKeyArray]) -> Carry:
         params, key = start
         nan = jnp.full((), jnp.nan, params.dtype)
         best = Best(params, nan, nan + jnp.inf, nan)
@@ -128,8 +129,8 @@ class Descent(Method):
         return Carry(params, self.init_state(params), key, best, zero, zero, zero, zero, stopped)
 
     def moved(
-        self, carry: Carry, index: Int[Array, ""], params: Float[Array, " dim"], state: PyTree, record: Record
-    ) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+        self, carry: Carry, index: Int[Array, ""], params: Vector, state: PyTree, record: Record
+    ) -> tuple[Carry, tuple[Record, Scalar]]:
         """Return the carry after a step, and the record of the step; nothing changes where a run has stopped.
 
         `params` and `state` are those after the step; unchanged, with `record.is_taken` False, if it could not be taken.
@@ -174,7 +175,7 @@ class Descent(Method):
             arrays, static = eqx.partition(self.options.evaluate, eqx.is_array)
             numbers, structure = jax.tree.flatten(arrays)
 
-            def finish(numbers: list[Array], at: Float[Array, " dim"], best: Best) -> tuple[Float[Array, ""], Best]:
+            def finish(numbers: list[Array], at: Vector, best: Best) -> tuple[Scalar, Best]:
                 cost = jnp.asarray(eqx.combine(jax.tree.unflatten(structure, numbers), static)(at), at.dtype)
                 return cost, best.against(Best.measured(at, cost))  # the last point competes with the best before
 

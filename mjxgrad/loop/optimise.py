@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
 from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective, flattened, of_vector
-from mjxgrad.objective.base import as_objective
+from mjxgrad.objective.base import Scalar, Vector, as_objective
 from mjxgrad.objective.parameters import Restored
 
-AnnealedObjective = Callable[[Float[Array, ""]], Objective]
+AnnealedObjective = Callable[[Scalar], Objective]
 Annealing = Callable[[ArrayLike], ArrayLike]
 """A schedule from the number of a step to a scale in (0, 1]."""
 
@@ -117,10 +117,10 @@ class GradientStep(Descent):
         """The optimiser; it accepts the cost as `value`, as `reduce_on_plateau` needs it."""
         return optax.with_extra_args_support(self.optimiser)
 
-    def init_state(self, params: Float[Array, " dim"]) -> PyTree:
+    def init_state(self, params: Vector) -> PyTree:
         return jax.tree.map(jnp.asarray, self.transformation.init(params))
 
-    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
         scale, objective = self.annealed(self.objective, carry.params, index)
         estimate = self.estimator(objective, carry.params, jax.random.fold_in(carry.key, index))
         change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
@@ -128,8 +128,8 @@ class GradientStep(Descent):
         return self.moved(carry, index, carry.params + change, state, record)
 
     def annealed(
-        self, objective: Objective | AnnealedObjective, params: Float[Array, " dim"], step: Int[Array, ""]
-    ) -> tuple[Float[Array, ""], Objective]:
+        self, objective: Objective | AnnealedObjective, params: Vector, step: Int[Array, ""]
+    ) -> tuple[Scalar, Objective]:
         """Return the scale of a step, 1 without annealing, and the objective at this scale."""
         if self.annealing is None:
             return jnp.ones((), params.dtype), as_objective(objective)
@@ -137,12 +137,8 @@ class GradientStep(Descent):
         return scale, objective if isinstance(objective, Objective) else objective(scale)
 
     def change(
-        self,
-        params: Float[Array, " dim"],
-        state: PyTree,
-        estimate: GradientEstimate,
-        gradient: Float[Array, " dim"],
-    ) -> tuple[Float[Array, " dim"], PyTree, Bool[Array, ""]]:
+        self, params: Vector, state: PyTree, estimate: GradientEstimate, gradient: Vector
+    ) -> tuple[Vector, PyTree, Bool[Array, ""]]:
         """Return the optimiser's change of the parameters, its state after, and whether the step is taken.
 
         The gradient is the sum of the estimate and of the gradient of anything else in the cost.
@@ -167,7 +163,7 @@ class EstimatedGradientState(eqx.Module):
 
     step: Int[Array, ""]
     num_skipped: Int[Array, ""]
-    scale: Float[Array, ""]
+    scale: Scalar
     estimate: GradientEstimate
     inner: PyTree
 
@@ -202,7 +198,7 @@ def estimated_gradient(
     """
     rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
-    def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Float[Array, ""], GradientEstimate]:
+    def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Scalar, GradientEstimate]:
         vector, restore = flattened(params)
         scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
         return scale, jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, step)))
