@@ -491,14 +491,12 @@ def _variance_intervals(
     for i in range(len(samples.is_noisy)):
         one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples)
         is_noisy = one.is_noisy > 0
-        costs, scores = one.rollouts.cost[is_noisy, 0], one.rollouts.noise_score[is_noisy, 0]
+        gradients, costs = one.rollouts.gradient_by_noise[is_noisy, 0], one.rollouts.cost[is_noisy, 0]
         is_finite = np.isfinite(costs)
         # Leaving one out is replaced by the mean, equal up to 1/N.
         centre = costs[is_finite].mean() if is_finite.any() else np.nan
-        terms = [
-            np.where(is_finite[:, None], one.rollouts.gradient_by_noise[is_noisy, 0], np.nan),
-            (costs - centre)[:, None] * scores,
-        ]
+        scored = (costs - centre)[:, None] * one.rollouts.noise_score[is_noisy, 0]
+        terms = [np.where(is_finite[:, None], gradients, np.nan), scored]
         terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
         intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)

@@ -87,17 +87,14 @@ class Parts(eqx.Module):
     """Moments of both parts over all units: samples, or pairs where starts are random.
 
     Attributes:
-        first: moments of the derivatives.
-        unbiased: moments of the unbiased terms.
         difference: moments of the unbiased terms minus the derivatives.
-        costs: moments of the costs.
         scaled: moments of the derivatives by the noise, in its standard deviations.
         secants: comparison of costs and derivatives over pairs.
         linear_variance: variance of the costs that the mean derivative explains, summed over samples.
         beta: sum of the shares of the linear part that were taken off.
         num_costs: number of samples in the last two sums.
         num_groups: number of groups of samples that share their baselines.
-        num_felt: number of units whose noise made a difference.
+        num_felt: see `Samples`.
     """
 
     first: Moments

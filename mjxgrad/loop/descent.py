@@ -73,8 +73,6 @@ class Carry(eqx.Module):
     state: PyTree
     key: PRNGKeyArray
     best: Best
-    num_steps: Int[Array, ""]
-    num_skipped: Int[Array, ""]
     num_in_a_row: Int[Array, ""]
     num_still: Int[Array, ""]
     stopped: Stopped
@@ -126,7 +124,7 @@ class Descent(Method):
         nan = jnp.full((), jnp.nan, params.dtype)
         best = Best(params, nan, nan + jnp.inf, nan)
         zero, stopped = jnp.zeros((), jnp.int32), jax.tree.map(jnp.asarray, Stopped.running)
-        return Carry(params, self.init_state(params), key, best, zero, zero, zero, zero, stopped)
+        return Carry(params, self.init_state(params), key, best, zero, zero, stopped)
 
     def moved(
         self, carry: Carry, index: Int[Array, ""], params: Vector, state: PyTree, record: Record
@@ -148,10 +146,8 @@ class Descent(Method):
         enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
         stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, stopped)
         stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
-        num_skipped, best = carry.num_skipped + ~record.is_taken, carry.best.against(candidate)
-        after = Carry(
-            params, state, carry.key, best, carry.num_steps + 1, num_skipped, num_in_a_row, num_still, stopped
-        )
+        best = carry.best.against(candidate)
+        after = Carry(params, state, carry.key, best, num_in_a_row, num_still, stopped)
         # One of several runs may have stopped before the others.
         as_it_was, as_it_is = (carry, (Record.blank(at.dtype), nan)), (after, (record, noise_free))
         return jax.tree.map(lambda old, new: jnp.where(self.is_over(carry), old, new), as_it_was, as_it_is)
@@ -171,6 +167,7 @@ class Descent(Method):
     def result(self, progress: Progress) -> Optimisation:
         carry, history = progress.carry, History.of(progress)
         best, final_cost = carry.best, jnp.full_like(carry.best.cost, jnp.nan)
+        was_done = np.isfinite(history.scale)  # NaN in steps that did not happen
         if self.options.evaluate is not None:
             arrays, static = eqx.partition(self.options.evaluate, eqx.is_array)
             numbers, structure = jax.tree.flatten(arrays)
@@ -188,8 +185,8 @@ class Descent(Method):
             final_cost=final_cost,
             history=history,
             stopped=carry.stopped,
-            num_steps=np.asarray(carry.num_steps),
-            num_skipped=np.asarray(carry.num_skipped),
+            num_steps=was_done.sum(axis=-1),
+            num_skipped=(was_done & ~history.is_taken).sum(axis=-1),
             num_rollouts=history.num_rollouts[..., -1],
             num_gradient_rollouts=history.num_gradient_rollouts[..., -1],
             seconds=float(progress.seconds.sum()),

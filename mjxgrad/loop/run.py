@@ -144,7 +144,12 @@ def run(
     steps = jax.jit(_steps(step, traced.out_info[1], method.is_over, segment), out_shardings=sharding)
     nothing = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), traced.out_info[1])
     progress = Progress(carry, nothing, np.zeros(0), time.perf_counter() - began)
-    identity = {} if checkpoint is None else _identity(method, start, numbers, traced.lower().as_text())
+    identity = {}
+    if checkpoint is not None:
+        # Classes of one name may differ in code. The lowered program has every number that is no argument, such as a rate.
+        text = np.frombuffer(traced.lower().as_text().encode(), np.uint8)
+        parts = {"start": start, "arrays": numbers, "program": text}
+        identity = method.identity() | {name: checkpoints.digest(part) for name, part in parts.items()}
     if checkpoint is not None and checkpoint.exists():
         carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
         progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
@@ -167,17 +172,6 @@ def run(
         if checkpoint is not None and is_first and progress.num_steps > on_disk:
             checkpoints.save(checkpoint, progress[:3], identity)
     return method.result(progress)
-
-
-def _identity(method: Method, start: PyTree, numbers: list[Array], program: str) -> dict[str, Any]:
-    """Return the fingerprint that a resumed run must share; a class of the same name may have other code."""
-    return {
-        **method.identity(),
-        "start": checkpoints.digest(start),
-        "arrays": checkpoints.digest(numbers),
-        # The lowered program contains every number that is not an argument, such as a learning rate.
-        "program": checkpoints.digest(np.frombuffer(program.encode(), np.uint8)),
-    }
 
 
 def mean(values: Shaped[np.ndarray, "..."]) -> float:
