@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
 from mjxgrad._arrays import whole
 from mjxgrad.estimators.moments import Moments
@@ -58,7 +58,18 @@ class Population(Descent):
         is_taken = is_finite.sum() >= self.least_finite
         new, stddev = self.move(params, width, at, jnp.where(is_finite, costs, jnp.inf))
         new, stddev = jnp.where(is_taken, new, params).astype(params.dtype), jnp.where(is_taken, stddev, width)
-        return self.moved(carry, index, new, stddev, _record(costs, is_finite, jnp.linalg.norm(new - params), is_taken))
+        found = Moments.of(costs, is_finite)
+        record = dataclasses.replace(
+            Record.blank(costs.dtype),
+            cost=jnp.where(found.count > 0, found.mean, jnp.nan),
+            cost_error=jnp.sqrt(found.squared_error()),
+            scale=jnp.ones((), costs.dtype),
+            step_norm=jnp.linalg.norm(new - params),
+            finite_fraction=is_finite.mean(dtype=costs.dtype),
+            num_rollouts=jnp.asarray(costs.size, jnp.int32),
+            is_taken=is_taken,
+        )
+        return self.moved(carry, index, new, stddev, record)
 
 
 def cross_entropy(
@@ -129,19 +140,3 @@ def search_stddev(
     if width.shape not in ((), (dim,)):
         raise ValueError(f"stddev must be one number or {dim}, got shape {width.shape}")
     return jnp.broadcast_to(width, (dim,))
-
-
-def _record(
-    costs: Float[Array, " n"], is_finite: Bool[Array, " n"], step_norm: Float[Array, ""], is_taken: Bool[Array, ""]
-) -> Record:
-    found = Moments.of(costs, is_finite)
-    return dataclasses.replace(
-        Record.blank(costs.dtype),
-        cost=jnp.where(found.count > 0, found.mean, jnp.nan),
-        cost_error=jnp.sqrt(found.squared_error()),
-        scale=jnp.ones((), costs.dtype),
-        step_norm=step_norm,
-        finite_fraction=is_finite.mean(dtype=costs.dtype),
-        num_rollouts=jnp.asarray(costs.size, jnp.int32),
-        is_taken=is_taken,
-    )
