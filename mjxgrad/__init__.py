@@ -9,14 +9,7 @@ from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify
 from mjxgrad.loop import History, Optimisation, Stopped, estimated_gradient, optimise
-from mjxgrad.objective import (
-    Objective,
-    SceneTask,
-    closed_loop,
-    linear_policy,
-    open_loop,
-    parameter_noise,
-)
+from mjxgrad.objective import Objective, SceneTask, closed_loop, linear_policy, open_loop, parameter_noise
 from mjxgrad.rollouts import (
     DivergedError,
     Linearisation,

@@ -5,6 +5,7 @@ A library must not print, and stdout may carry a program's results. Only those t
 dropped; other output of the import is passed on.
 """
 
+# ruff: noqa: F401
 import contextlib
 import importlib.metadata
 import io
@@ -32,20 +33,3 @@ finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 
 MJX_VERSION = importlib.metadata.version("mujoco-mjx")
-
-__all__ = [
-    "COLLISION_FUNCTIONS",
-    "MJX_VERSION",
-    "compensate_gravity",
-    "contact_groups",
-    "counts",
-    "custom_number",
-    "fluid_force",
-    "geom_groups",
-    "geom_pairs",
-    "has_collision_fn",
-    "make_efc_address",
-    "make_efc_type",
-    "make_frame",
-    "mjx",
-]

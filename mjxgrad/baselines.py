@@ -1,9 +1,8 @@
 r"""Search without derivatives in the same loop, with rollouts counted alike.
 
 A search draws candidates $\theta_i = \mu + \sigma \epsilon_i$ around the present point $\mu$ and moves it by its own
-rule. The search noise replaces the objective's noise: candidates are rolled out without it, or, where a task's
-start is random, each with its own start. The cost in the history is the mean over the candidates. The best
-parameters are among the points $\mu$, whose noise-free cost `evaluate` measures.
+rule. Candidates are rolled out without the objective's noise, but from random starts where the task has them. The cost in
+the history is the mean over the candidates. The best parameters are among the points $\mu$.
 """
 
 import dataclasses
@@ -14,14 +13,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, Key
 
 from mjxgrad._arrays import whole
+from mjxgrad.estimators.moments import Moments
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
 from mjxgrad.loop.run import run
-from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise
-from mjxgrad.objective.base import as_objective
+from mjxgrad.objective import Objective, OpenLoop, ParameterNoise
+from mjxgrad.objective.base import as_objective, positive
 
 __all__ = ["Population", "cross_entropy"]
 
@@ -52,12 +52,24 @@ class Population(Descent):
         directions = jax.random.normal(search_key, (self.num_samples, params.size), params.dtype)
         at = params + width * (directions.at[0].set(0) if self.has_present else directions)
         rollout_keys = jax.random.split(rollout_key, self.num_samples)
-        costs = jax.vmap(objective.value)(at, jax.vmap(lambda one: without_action_noise(objective, one))(rollout_keys))
+        noise = jax.vmap(lambda one: objective.silence(objective.sample_noise(one)))(rollout_keys)
+        costs = jax.vmap(objective.value)(at, noise)
         is_finite = jnp.isfinite(costs)
         is_taken = is_finite.sum() >= self.least_finite
         new, stddev = self.move(params, width, at, jnp.where(is_finite, costs, jnp.inf))
         new, stddev = jnp.where(is_taken, new, params).astype(params.dtype), jnp.where(is_taken, stddev, width)
-        return self.moved(carry, index, new, stddev, _record(costs, is_finite, jnp.linalg.norm(new - params), is_taken))
+        found = Moments.of(costs, is_finite)
+        record = dataclasses.replace(
+            Record.blank(costs.dtype),
+            cost=jnp.where(found.count > 0, found.mean, jnp.nan),
+            cost_error=jnp.sqrt(found.squared_error()),
+            scale=jnp.ones((), costs.dtype),
+            step_norm=jnp.linalg.norm(new - params),
+            finite_fraction=is_finite.mean(dtype=costs.dtype),
+            num_rollouts=jnp.asarray(costs.size, jnp.int32),
+            is_taken=is_taken,
+        )
+        return self.moved(carry, index, new, stddev, record)
 
 
 def cross_entropy(
@@ -74,9 +86,7 @@ def cross_entropy(
     r"""Minimise a cost by the cross-entropy method.
 
     Every step draws candidates from $N(\mu, \mathrm{diag}\,\sigma^2)$ and fits $\mu$ and $\sigma$ to the `num_elite`
-    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$).
-    Candidates are rolled out without the objective's noise, from random starts where the task has them. Candidates that are
-    not finite are never elite. A step with fewer than `num_elite` finite ones is not taken.
+    best ones, by maximum likelihood (so $\sigma$ has no $n - 1$). A step with fewer finite ones is not taken.
 
     Args:
         objective: the objective; only its cost is used.
@@ -111,15 +121,6 @@ def cross_entropy(
     return run(method, **method.begun(params, key))
 
 
-def without_action_noise(objective: Objective, key: PRNGKeyArray) -> PyTree:
-    """Return rollout noise with none on actions or parameters, but a random start where the task has one."""
-    if isinstance(objective, ActionNoise):
-        _, start = objective.split(objective.sample_noise(key))
-        if start is not None:
-            return jnp.zeros(objective.noise_shape, objective.stddev.dtype), start
-    return objective.zero_noise()
-
-
 def search_stddev(
     objective: Objective, params: Float[Array, "..."], stddev: ArrayLike | None, num_samples: int
 ) -> Float[Array, " dim"]:
@@ -127,40 +128,15 @@ def search_stddev(
     as_objective(objective)
     whole("num_samples", num_samples, 2)
     dim = jnp.shape(params)[-1] if jnp.ndim(params) else 1
-    if stddev is None and isinstance(objective, OpenLoop):
-        return jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape))
-    if stddev is None and isinstance(objective, ParameterNoise):
-        return jnp.broadcast_to(objective.stddev, (dim,))
+    if stddev is None and isinstance(objective, OpenLoop | ParameterNoise):
+        shape = objective.noise_shape if isinstance(objective, OpenLoop) else (dim,)
+        return jnp.ravel(jnp.broadcast_to(objective.stddev, shape))
     if stddev is None:
         raise ValueError(
             f"stddev must be given for {type(objective).__name__}, whose noise is not on the parameters; "
             "it is the width of the search, in the parameters' units"
         )
-    width = jnp.asarray(stddev, float)
+    width = positive(jnp.asarray(stddev, float))
     if width.shape not in ((), (dim,)):
         raise ValueError(f"stddev must be one number or {dim}, got shape {width.shape}")
-    if not bool((width > 0).all()):
-        raise ValueError(f"stddev must be positive, got {stddev}")
     return jnp.broadcast_to(width, (dim,))
-
-
-def _record(
-    costs: Float[Array, " num_samples"],
-    is_finite: Bool[Array, " num_samples"],
-    step_norm: Float[Array, ""],
-    is_taken: Bool[Array, ""],
-) -> Record:
-    count = is_finite.sum()
-    mean = jnp.where(count > 0, jnp.mean(costs, where=is_finite), jnp.nan)
-    variance = jnp.sum(jnp.where(is_finite, costs - mean, 0) ** 2) / jnp.maximum(count - 1, 1)
-    error = jnp.where(count > 1, jnp.sqrt(variance / jnp.maximum(count, 1)), jnp.nan)
-    return dataclasses.replace(
-        Record.blank(costs.dtype),
-        cost=mean,
-        cost_error=error.astype(costs.dtype),
-        scale=jnp.ones((), costs.dtype),
-        step_norm=step_norm,
-        finite_fraction=is_finite.mean(dtype=costs.dtype),
-        num_rollouts=jnp.asarray(costs.size, jnp.int32),
-        is_taken=is_taken,
-    )

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import norm
 
 import mjxgrad as mg
-from mjxgrad.baselines import cross_entropy, without_action_noise
+from mjxgrad.baselines import cross_entropy
 from tests.estimators import textbook
 
 CENTRE = jnp.array([1.0, -2.0])
@@ -84,7 +84,7 @@ class RandomStart(textbook.LinearSystem):
 
 def test_candidates_have_starts_of_their_own_and_no_noise_on_actions(key):
     cost = mg.open_loop(RandomStart(), 0.1)
-    actions, starts = jax.vmap(lambda k: without_action_noise(cost, k))(jax.random.split(key, 50))
+    actions, starts = jax.vmap(lambda k: cost.silence(cost.sample_noise(k)))(jax.random.split(key, 50))
     np.testing.assert_array_equal(actions, 0)
     assert len(np.unique(starts[:, 0])) == 50
 

@@ -241,7 +241,7 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
     """
     objective = objective.sized_for(params)
     plan = plan_by_noise(objective, num_samples, None)
-    (parts,) = stream(objective, params, key, plan, functools.partial(both_parts, control_variate=True))
+    parts = stream(objective, params, key, plan, functools.partial(both_parts, control_variate=True))
     weights = weigh(Consistent(), parts, plan)
     reason = jnp.asarray(weights.reason._value)  # pyright: ignore[reportAttributeAccessIssue]
     return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha, reason, parts.costs.mean)

@@ -76,11 +76,11 @@ def least_squares(
     samples = jax.lax.map(lambda some: sample(objective, vector, key, plan, some), units)
     samples = jax.tree.map(lambda leaf: leaf.reshape(num_chunks * size, *leaf.shape[2:]), samples)
     mask = samples.zeroth_order_mask()
-    costs = Moments.of(samples.costs[:, 0], mask)
+    costs = Moments.of(samples.rollouts.cost[:, 0], mask)
     # Scores times the standard deviation: comparable size in all coordinates, whatever their units.
     stddev = jnp.ravel(jnp.broadcast_to(objective.stddev, objective.noise_shape)).astype(vector.dtype)
-    noise = jnp.where(mask[:, None], samples.scores[:, 0] * stddev, 0)
-    slope, squared_error = _fit(noise, jnp.where(mask, samples.costs[:, 0] - costs.mean, 0), mask)
+    noise = jnp.where(mask[:, None], samples.rollouts.noise_score[:, 0] * stddev, 0)
+    slope, squared_error = _fit(noise, jnp.where(mask, samples.rollouts.cost[:, 0] - costs.mean, 0), mask)
     return assemble(
         slope / stddev,
         squared_error / stddev**2,

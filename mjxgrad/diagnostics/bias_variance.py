@@ -35,7 +35,7 @@ from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.rules import Consistent
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, sample
-from mjxgrad.objective import Objective, ParameterNoise
+from mjxgrad.objective import Differentiated, Objective, ParameterNoise
 from mjxgrad.objective.base import unchanged
 from mjxgrad.report import require
 from mjxgrad.scene import SceneWarning
@@ -413,10 +413,12 @@ def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNG
 def _by_parameters(samples: Samples) -> Samples:
     """Apply the chain rule from the noise to the parameters, for the gradient and score of each unit and rollout."""
     vjp = jax.vmap(jax.vmap(lambda pull_back, x: pull_back(x)))
-    gradients, scores = (vjp(samples.pull_backs, x) for x in (samples.gradients, samples.scores))
-    # These standard deviations belong to the noise; the parameters have none.
-    known = {"gradients": gradients, "scores": scores, "stddevs": jnp.full_like(scores, jnp.nan)}
-    return dataclasses.replace(samples, **known, pull_backs=Partial(unchanged))
+    found = samples.rollouts
+    gradients, scores = (vjp(found.pull_back, x) for x in (found.gradient_by_noise, found.noise_score))
+    # The standard deviations belong to the noise; the parameters have none.
+    unknown = jnp.full_like(scores, jnp.nan)
+    rollouts = Differentiated(found.cost, gradients, scores, unknown, Partial(unchanged))
+    return dataclasses.replace(samples, rollouts=rollouts)
 
 
 def _in_batches(
@@ -427,7 +429,7 @@ def _in_batches(
     batches = jax.tree.map(lambda leaf: leaf[: count * _BATCH].reshape(count, _BATCH, *leaf.shape[1:]), samples)
 
     def one(batch: Samples) -> tuple[Array, Array, Array]:
-        (parts,) = both_parts(batch, control_variate=True)
+        parts = both_parts(batch, control_variate=True)
         alpha = weigh(Consistent(), parts, plan).alpha
         value, _ = parts.mixture(jnp.broadcast_to(alpha, parts.first.offset.shape))
         return jnp.where(parts.unbiased.count > 1, value, jnp.nan), alpha, parts.unbiased.count > 1
@@ -447,7 +449,7 @@ def _in_batches(
 
 def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
     """Return the unbiased part of α-order and its standard error; see `control_variate`."""
-    (parts,) = both_parts(samples, control_variate=True)
+    parts = both_parts(samples, control_variate=True)
     value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
     return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
 
@@ -472,14 +474,15 @@ def _variance_intervals(
 ) -> Float[np.ndarray, "estimates 2 points"]:
     """Bootstrap the variance per rollout of each estimate at each point; axes: estimate, interval end, point."""
     intervals = []
-    for i in range(len(samples.costs)):
+    for i in range(len(samples.is_noisy)):
         one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples)
         is_noisy = one.is_noisy > 0
-        costs, scores = one.costs[is_noisy, 0], one.scores[is_noisy, 0]
+        gradients, costs = one.rollouts.gradient_by_noise[is_noisy, 0], one.rollouts.cost[is_noisy, 0]
         is_finite = np.isfinite(costs)
         # Leaving one out is replaced by the mean, equal up to 1/N.
         centre = costs[is_finite].mean() if is_finite.any() else np.nan
-        terms = [np.where(is_finite[:, None], one.gradients[is_noisy, 0], np.nan), (costs - centre)[:, None] * scores]
+        scored = (costs - centre)[:, None] * one.rollouts.noise_score[is_noisy, 0]
+        terms = [np.where(is_finite[:, None], gradients, np.nan), scored]
         terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
         intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)

@@ -7,16 +7,11 @@ from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, walker2d
 
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
-    "ant": ant,
-    "half_cheetah": half_cheetah,
-    "hopper": hopper,
-    "humanoid": humanoid,
-    "walker2d": walker2d,
-    "diffrl_ant": diffrl.ant,
-    "diffrl_cartpole": diffrl.cartpole,
-    "diffrl_half_cheetah": diffrl.half_cheetah,
-    "diffrl_hopper": diffrl.hopper,
-    "diffrl_humanoid": diffrl.humanoid,
+    **{make.__name__: make for make in (ant, half_cheetah, hopper, humanoid, walker2d)},
+    **{
+        f"diffrl_{make.__name__}": make
+        for make in (diffrl.ant, diffrl.cartpole, diffrl.half_cheetah, diffrl.hopper, diffrl.humanoid)
+    },
 }
 
 __all__ = [

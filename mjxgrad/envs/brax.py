@@ -1,4 +1,4 @@
-"""Any environment as a brax environment, for brax's learners: `ppo.train(BraxEnv(mg.envs.ant()), episode_length=1000, ...)`.
+"""Any environment as a brax environment, for brax's learners.
 
 Brax 0.14.2 calls `jax.device_put_replicated`, which jax 0.10 has removed: its learners need an earlier jax, or a
 substitute for this function.
@@ -17,10 +17,10 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """An environment for brax's wrappers: `train(BraxEnv(environment), environment.episode_length, ...)`.
+    """An environment for brax: `ppo.train(BraxEnv(environment), episode_length=environment.episode_length, ...)`.
 
-    Brax's wrappers reset it and end it by the learner's episode length; `done` is only an end for good. If friction, masses
-    and gains are random, each copy draws its own in `reset` and keeps them.
+    Brax's wrappers reset it and end it by the learner's episode length; `done` is only an end for good. Each copy draws what
+    is random in `reset` and keeps it.
     """
 
     def __init__(self, environment: Environment):
@@ -28,12 +28,12 @@ class BraxEnv(Env):
 
     def reset(self, rng: PRNGKeyArray | UInt32[Array, "2"]) -> State:
         key = rng if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(rng)
-        changes, physics = self.environment.begin(key)
-        return _brax_state(State(None, None, None, None, info={"changes": changes}), physics)  # pyright: ignore[reportArgumentType]
+        copy_key, now = self.environment.begin(key)
+        return _brax_state(State(None, None, None, None, info={"copy_key": copy_key}), now)  # pyright: ignore[reportArgumentType]
 
     def step(self, state: State, action: Float[Array, " nu"]) -> State:
         before: EnvState = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return _brax_state(state, self.environment.with_changes(state.info["changes"]).step(before, action))
+        return _brax_state(state, self.environment.randomised(state.info["copy_key"]).step(before, action))
 
     @property
     def observation_size(self) -> int:

@@ -1,8 +1,7 @@
 r"""The tasks on which SHAC and its successors are compared: ant, hopper, cheetah, humanoid and a cart-pole swing-up.
 
-Observations, rewards and ends are DiffRL's, and so are all starts but the cart-pole's. The bodies are gymnasium's, and contact
-is MuJoCo's. Returns are comparable within this project, but with published ones only as ratios. An action holds for 1/60 s, and
-an episode has 1000 actions (cart-pole 240).
+Observations, rewards, ends and all starts but the cart-pole's are DiffRL's, bodies gymnasium's. Contact is MuJoCo's, so
+returns compare with published ones only as ratios. An action holds for 1/60 s, and an episode has 1000 (cart-pole 240).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.bodies.spatial import exponential, multiply, rotation_matrix
-from mjxgrad.envs.environment import Environment
+from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks.action_task import robot_scene, scene_path
@@ -61,9 +60,7 @@ class Walker(Environment):
         course = jnp.stack([upright, heading])
         return jnp.concatenate([base, state.qvel[:6], joints, 0.1 * state.qvel[6:], course, memory["action"]])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Memory) -> Rewards:
         upright, heading = _posture(after)
         height = after.qpos[2] - self.fallen
         rise = height if self.rise_scale is None else _rise(height - 0.1, self.rise_scale, 0.1)
@@ -95,9 +92,7 @@ class Planar(Environment):
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
         return jnp.concatenate([state.qpos[1:], state.qvel])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         terms = {"forward": after.qvel[0], "action": -0.1 * (action**2).sum()}
         if self.fallen is None:
             return terms
@@ -126,9 +121,7 @@ class CartPole(Environment):
         (place, angle), (speed, rate) = state.qpos, state.qvel
         return jnp.stack([place, speed, jnp.sin(angle), jnp.cos(angle), rate])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         (place, angle), (speed, rate) = after.qpos, after.qvel
         upward = jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
         return {"pole": -(upward**2) - 0.1 * rate**2, "cart": -0.05 * place**2 - 0.1 * speed**2}

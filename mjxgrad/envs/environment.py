@@ -2,8 +2,7 @@
 
 `reset(key)` and `step(state, action)` are like those of brax and MuJoCo Playground: traceable, mapped over batches by
 `jax.vmap` and differentiated by `jax.grad`. Compile them as `jax.jit(lambda state, action: env.step(state, action))`, since
-`jax.jit(env.step)` would need a hash, which a pytree of arrays has not. Your own environment gives three or four methods and
-inherits the rest.
+`jax.jit(env.step)` would need a hash, which a pytree of arrays has not.
 """
 
 import dataclasses
@@ -16,11 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
-from mjxgrad.objective.task import InScene, optional_pytree
+from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
+Rewards = dict[str, Float[Array, ""]]
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """A function from a key and a scene to a scene with other friction, masses or gains, by `scene.with_model`."""
 
@@ -73,7 +73,7 @@ class Environment(InScene):
     contact: Contact = eqx.field(default=Discrete(), kw_only=True)
     frame_skip: int = eqx.field(static=True, default=1, kw_only=True)
     episode_length: int = eqx.field(static=True, default=1000, kw_only=True)
-    randomisation: Randomisation | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
+    randomisation: Randomisation | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
 
     def __check_init__(self):
         for name in ("frame_skip", "episode_length"):
@@ -85,9 +85,7 @@ class Environment(InScene):
         """Return the observation of the policy."""
 
     @abstractmethod
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         """Return the terms of the reward of one step; the reward is their sum.
 
         Args:
@@ -206,8 +204,7 @@ class Environment(InScene):
     def refined(self, times: int) -> "Environment":
         """Return the environment with time steps shorter by a factor of `times`; an action lasts as long as before.
 
-        Where contact lasts few time steps, a policy's return depends on the time step as well as on the scene. With shorter
-        steps it depends on the scene alone.
+        Where contact lasts few time steps, a policy's return depends on the time step as well as on the scene.
 
         Raises:
             ValueError: if `times` is no whole number, or below 1.
@@ -216,22 +213,7 @@ class Environment(InScene):
         scene = eqx.tree_at(lambda s: s.model.opt.timestep, self.scene, self.scene.model.opt.timestep / times)
         return dataclasses.replace(self, scene=scene, frame_skip=times * self.frame_skip)
 
-    def changes(self, key: PRNGKeyArray) -> PyTree:
-        """Draw the numbers in which one copy differs, see `randomised`; a batch of copies shares all others.
-
-        Returns:
-            The copy's own numbers, for `with_changes`.
-        """
-        pairs = zip(jax.tree.leaves(self.randomised(key)), jax.tree.leaves(self), strict=True)
-        return [None if copied is own else copied for copied, own in pairs]
-
-    def with_changes(self, changes: PyTree) -> "Environment":
-        """Return the copy with its own numbers, as drawn by `changes`."""
-        own, structure = jax.tree.flatten(self)
-        return structure.unflatten([x if new is None else new for x, new in zip(own, changes, strict=True)])
-
-    def begin(self, key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
-        """Return the changes of one copy, and the start of its first episode."""
+    def begin(self, key: PRNGKeyArray) -> tuple[PRNGKeyArray, EnvState]:
+        """Return the key of one copy, for `randomised`, and the start of its first episode."""
         copy_key, reset_key = jax.random.split(key)
-        changes = self.changes(copy_key)
-        return changes, self.with_changes(changes).reset(reset_key)
+        return copy_key, self.randomised(copy_key).reset(reset_key)

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad.envs import ENVIRONMENTS, load
 from mjxgrad.envs.environment import Environment, EnvState
@@ -36,6 +36,11 @@ class _Adapter:
         self.render_mode, self._view = render_mode, view
         self.metadata = {**_METADATA, "render_fps": round(1 / float(self.environment.interval))}
 
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
+        super().reset(seed=seed, options=options)
+        self._copy_key, self._state = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
+        return np.asarray(self._state.obs), self._info(self._state)
+
     def _spaces(self) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
         obs = jax.eval_shape(self.environment.reset, jax.random.key(0)).obs
         seen = gymnasium.spaces.Box(-np.inf, np.inf, obs.shape, obs.dtype)
@@ -48,10 +53,7 @@ class _Adapter:
 
 
 class GymEnv(_Adapter, gymnasium.Env):
-    """One copy of an environment. `reset` draws its friction, masses and gains anew, if they are random.
-
-    The environment's own `episode_length` is the only limit of steps.
-    """
+    """One copy of an environment, limited by its `episode_length`; `reset` draws what is random in it anew."""
 
     metadata = _METADATA
 
@@ -69,26 +71,23 @@ class GymEnv(_Adapter, gymnasium.Env):
         self._prepare(environment, render_mode, view)
         self.observation_space, self.action_space = self._spaces()
         self._begin = jax.jit(lambda key: self.environment.begin(key))
-        self._advance = jax.jit(
-            lambda changes, state, action: self.environment.with_changes(changes).step(state, action)
-        )
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
-        super().reset(seed=seed, options=options)
-        self._changes, self._state = self._begin(_key(self.np_random))
-        return np.asarray(self._state.obs), _info(self._state)
+        self._advance = jax.jit(lambda key, state, action: self.environment.randomised(key).step(state, action))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, _Info]:
-        state = self._state = self._advance(self._changes, self._state, jnp.asarray(action))
-        return np.asarray(state.obs), float(state.reward), bool(state.terminated), bool(state.truncated), _info(state)
+        state = self._state = self._advance(self._copy_key, self._state, jnp.asarray(action))
+        ends = bool(state.terminated), bool(state.truncated)
+        return np.asarray(state.obs), float(state.reward), *ends, self._info(state)
 
     def render(self) -> np.ndarray | None:
         """Draw the present state, in the render mode "rgb_array"."""
         return None if self.render_mode is None else self._drawn(self._state.physics.qpos[None])[0]
 
+    def _info(self, state: EnvState) -> _Info:
+        return {name: float(value) for name, value in state.metrics.items()}
+
 
 class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
-    """Many copies of an environment in one program, each with its own friction, masses and gains, if they are random.
+    """Many copies of an environment in one program, each with its own draw of what is random.
 
     A copy whose episode ends starts the next one in the same step: the observation is already the new one. `final_obs` and
     `final_info` hold the last ones of the old episode.
@@ -107,21 +106,14 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        def begin(key: PRNGKeyArray) -> tuple[PyTree, EnvState]:
-            return jax.vmap(self.environment.begin)(jax.random.split(key, num_envs))
+        def advance(key: PRNGKeyArray, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
+            return self.environment.randomised(key).step_on(state, action)
 
-        def advance(changes: PyTree, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
-            return self.environment.with_changes(changes).step_on(state, action)
-
-        self._begin, self._advance = jax.jit(begin), jax.jit(jax.vmap(advance))
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
-        super().reset(seed=seed, options=options)
-        self._changes, self._state = self._begin(_key(self.np_random))
-        return np.asarray(self._state.obs), self._info(self._state)
+        self._begin = jax.jit(lambda key: jax.vmap(self.environment.begin)(jax.random.split(key, num_envs)))
+        self._advance = jax.jit(jax.vmap(advance))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Info]:
-        ended, self._state = self._advance(self._changes, self._state, jnp.asarray(actions))
+        ended, self._state = self._advance(self._copy_key, self._state, jnp.asarray(actions))
         done = np.asarray(ended.done)
         infos = {**self._ends(ended, done), **self._info(self._state)}
         outcome = (np.asarray(x) for x in (self._state.obs, ended.reward, ended.terminated, ended.truncated))
@@ -145,29 +137,16 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         return infos
 
 
-def register() -> None:
-    """Register `ENVIRONMENTS` with gymnasium."""
-    for name in ENVIRONMENTS:
-        gymnasium.register(
-            gym_name(name),
-            entry_point=f"{__name__}:{GymEnv.__name__}",
-            vector_entry_point=f"{__name__}:{GymVectorEnv.__name__}",
-            kwargs={"environment": name},
-        )
-
-
 def gym_name(name: str) -> str:
     """Return gymnasium's name of one of `ENVIRONMENTS`: `diffrl_ant` is `mjxgrad/DiffRLAnt-v0`."""
     words = ["DiffRL" if word == "diffrl" else word.capitalize() for word in name.split("_")]
     return f"mjxgrad/{''.join(words)}-v0"
 
 
-def _key(generator: np.random.Generator) -> PRNGKeyArray:
-    return jax.random.key(int(generator.integers(2**31)))
-
-
-def _info(state: EnvState) -> _Info:
-    return {name: float(value) for name, value in state.metrics.items()}
-
-
-register()
+for _name in ENVIRONMENTS:
+    gymnasium.register(
+        gym_name(_name),
+        entry_point=f"{__name__}:{GymEnv.__name__}",
+        vector_entry_point=f"{__name__}:{GymVectorEnv.__name__}",
+        kwargs={"environment": _name},
+    )

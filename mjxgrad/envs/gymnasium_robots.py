@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.bodies.kinematics import kinematics
-from mjxgrad.envs.environment import Environment
+from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.rollouts.state import data_of
 from mjxgrad.tasks.action_task import robot_scene
@@ -62,9 +62,7 @@ class Robot(Environment):
         speeds = jnp.clip(state.qvel, -self.speed_limit, self.speed_limit)
         return jnp.concatenate([state.qpos[self.num_unseen :], speeds])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         speed = (self._place(after) - self._place(before)) / self.interval
         return {
             "forward": self.forward_weight * speed,

@@ -32,12 +32,12 @@ def load(
     Args:
         name: name for `registry.load`, for instance "CartpoleSwingup".
         config_overrides: values by flattened name; `impl` is always "jax", the implementation that has derivatives.
-        contact: how contact is stepped, see `mg.step`.
+        contact: see `stepped_right`.
         iterations: see `stepped_right`.
 
     Raises:
         ImportError: if playground is not installed.
-        ValueError: if there is no such environment, or contact does not suit `mg.step`.
+        ValueError: if there is no such environment, or as in `stepped_right`.
     """
     # Imported here: brax's environments need no playground.
     try:
@@ -56,8 +56,7 @@ def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterat
             your own. Only this object changes.
         contact: how contact is stepped, see `mg.step`.
         iterations: least limit on the solver's iterations; it stops at the model's tolerance. Many of their models stop after
-            1 to 4, far from the tolerance where feet hit the ground. The motion is then not the model's, and the solve's
-            derivative is not the motion's.
+            1 to 4, where the solve's derivative is not yet that of the motion.
 
     Returns:
         The same object.

@@ -4,12 +4,11 @@ For two samples that differ only in their noise, the trapezoidal rule along the 
 
 $$f_j - f_k = \tfrac12 (\nabla f_j + \nabla f_k)\cdot(w_j - w_k) + r_{jk}.$$
 
-The residual is zero for every quadratic. Where $f$ is smooth it is of third order in the distance. A jump between the two
-samples is wholly in it, and it is large if only one of them met a stiff slope. It needs no bound, no rate and no minimum
-number of samples: two samples on different sides of a jump are enough.
+The residual is zero for every quadratic, and of third order in the distance where $f$ is smooth. A jump between the two
+samples is wholly in it: two samples on different sides of a jump are enough.
 
-The test uses secants: residuals and differences are divided by the distance. Near pairs therefore count most, where smooth
-functions are flat and jumps are not. In many dimensions all distances are alike.
+The test divides residuals and differences by the distance. Near pairs therefore count most, where smooth functions are flat
+and jumps are not. In many dimensions all distances are alike.
 
 The residual also bounds the bias. Let $J$ be the part of the cost that derivatives miss. The bias of the first-order
 estimate is $-\mathbb{E}[J s]$. The components of $\sigma s$ are orthonormal, so its norm is at most

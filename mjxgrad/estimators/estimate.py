@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan
+from mjxgrad.objective.base import Scalar, Vector
 
 
 class Diagnosis(eqx.Enumeration):
@@ -40,14 +41,13 @@ class Reason(eqx.Enumeration):
 class GradientEstimate(eqx.Module):
     r"""An estimate of $\nabla F(\theta)$ with its errors and the rollouts spent on it.
 
-    `covariance_diagonal` is per rollout for every estimator: `standard_error` is the root of it divided by `num_finite`.
-    It accounts for the dependence of samples through a leave-one-out baseline and through antithetic pairs.
+    Errors account for the dependence of samples through a leave-one-out baseline and through antithetic pairs.
 
     Attributes:
         value: the estimate, NaN if fewer than two independent samples were finite. It and the next two have the form of
             the parameters, with None in place of leaves that are no floating-point arrays.
         standard_error: standard error of each coordinate of `value`.
-        covariance_diagonal: variance of each coordinate, per rollout.
+        covariance_diagonal: variance of each coordinate, per rollout: the squared error times `num_finite`.
         objective_mean: mean cost under noise, an estimate of $F(\theta)$.
         objective_standard_error: standard error of `objective_mean`.
         num_samples: rollouts with noise that were asked for.
@@ -64,16 +64,16 @@ class GradientEstimate(eqx.Module):
     value: PyTree[Float[Array, "..."]]
     standard_error: PyTree[Float[Array, "..."]]
     covariance_diagonal: PyTree[Float[Array, "..."]]
-    objective_mean: Float[Array, ""]
-    objective_standard_error: Float[Array, ""]
+    objective_mean: Scalar
+    objective_standard_error: Scalar
     num_samples: Int[Array, ""]
     num_finite: Int[Array, ""]
     num_rollouts: Int[Array, ""]
     num_gradient_rollouts: Int[Array, ""]
     diagnosis: Diagnosis
-    alpha: Float[Array, ""]
+    alpha: Scalar
     reason: Reason
-    bias_bound: Float[Array, ""]
+    bias_bound: Scalar
 
     @property
     def variance(self) -> Float[Array, "*batch"]:
@@ -102,14 +102,14 @@ def is_nothing_felt(plan: Plan, costs: Moments, num_felt: Int[Array, ""]) -> Boo
 
 
 def assemble(
-    value: Float[Array, " dim"],
-    squared_error: Float[Array, " dim"],
+    value: Vector,
+    squared_error: Vector,
     costs: Moments,
     plan: Plan,
     *,
     count: Int[Array, ""],
     num_felt: Int[Array, ""],
-    restore: Callable[[Float[Array, " dim"]], PyTree],
+    restore: Callable[[Vector], PyTree],
     has_baseline: Bool[Array, ""] | bool = True,
     alpha: ArrayLike = 0.0,
     reason: Any = Reason.fixed,
@@ -117,9 +117,8 @@ def assemble(
 ) -> GradientEstimate:
     """Assemble an estimate; its value is NaN where too few units were finite.
 
-    Moments and counts are over independent units: samples, or pairs of them. `count` is the number of finite units,
-    `num_felt` that of units whose noise made a difference, or cannot tell. `restore` maps a vector to the form of the
-    parameters, and `has_baseline` says whether the baseline is finite.
+    Moments and counts are over units: samples, or pairs of them. `count` is the number of finite units; see also
+    `Samples.num_felt`. `restore` maps a vector to the form of the parameters.
     """
     num_finite = count * plan.rollouts_per_unit
     exists = (count >= 2) & has_baseline

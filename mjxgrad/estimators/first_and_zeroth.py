@@ -4,12 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
-from mjxgrad.estimators.moments import Moments, ScoreMoments, Total, as_real
+from mjxgrad.estimators.moments import Moments, ScoreMoments, as_real
 from mjxgrad.estimators.samples import Plan, Samples, plan_for_baseline, stream
 from mjxgrad.objective import Objective, as_vector
+from mjxgrad.objective.base import Vector
 
 
 def first_order(
@@ -93,50 +94,49 @@ def first_and_zeroth_order(
 ) -> tuple[GradientEstimate, GradientEstimate]:
     """Estimate the gradient in first and in zeroth order from the same differentiated rollouts.
 
-    Arguments and errors are those of `zeroth_order`, and so are the estimates of both functions from the same key. The two
-    are dependent, and each reports the rollouts spent on both: do not add them. A sample with a finite cost but no finite
-    derivative counts in the second only.
+    Arguments, errors and estimates are those of both functions. The two are dependent, and each reports the rollouts spent
+    on both: do not add them. A sample with a finite cost but no finite derivative counts in the second only.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
     return both_results(stream(objective, vector, key, plan, both_summary), plan, baseline, restore)
 
 
-def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Total]:
+def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Array]:
     """Return the moments of gradients and of costs, and the number of units that felt their noise."""
     mask = samples.first_order_mask()
-    gradients = Moments.of(samples.gradients.mean(axis=1), mask)
-    return gradients, Moments.of(samples.costs.mean(axis=1), mask), Total(samples.num_felt())
+    rollouts = samples.rollouts
+    gradients = Moments.of(rollouts.gradient_by_noise.mean(axis=1), mask)
+    return gradients, Moments.of(rollouts.cost.mean(axis=1), mask), samples.num_felt()
 
 
 def first_order_result(summary: tuple[Any, ...], plan: Plan, restore: Callable) -> GradientEstimate:
     """Return the estimate from the summary of `first_order_summary`."""
-    gradients, costs, felt = summary
+    gradients, costs, num_felt = summary
     return assemble(
         gradients.mean,
         gradients.squared_error(),
         costs,
         plan,
         count=gradients.count,
-        num_felt=felt.value,
+        num_felt=num_felt,
         restore=restore,
         alpha=1.0,
         bias_bound=jnp.nan,
     )
 
 
-def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Total]:
-    """Return joint moments of costs and scores, moments of the costs, and the cost without noise."""
+def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Array, Array]:
+    """Return joint moments of costs and scores, moments of the costs, the cost without noise, and units that felt it."""
     mask = samples.zeroth_order_mask()
-    moments = ScoreMoments.of(samples.costs - samples.zero_noise_costs[:, None], samples.scores, mask)
-    sums = Total((samples.noise_free_cost(), samples.num_felt()))
-    return moments, Moments.of(samples.costs.mean(axis=1), mask), sums
+    costs, scores = samples.rollouts.cost, samples.rollouts.noise_score
+    moments = ScoreMoments.of(costs - samples.zero_noise_costs[:, None], scores, mask)
+    return moments, Moments.of(costs.mean(axis=1), mask), samples.noise_free_cost(), samples.num_felt()
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, restore: Callable) -> GradientEstimate:
     """Return the estimate from the summary of `zeroth_order_summary`."""
-    moments, costs, sums = summary
-    noise_free_cost, num_felt = sums.value
+    moments, costs, noise_free_cost, num_felt = summary
     if baseline == "leave_one_out":
         value, squared_error = _leave_one_out(moments)
     else:
@@ -157,18 +157,18 @@ def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, res
 
 
 def both_summary(samples: Samples) -> tuple:
-    """Return the summaries of both estimates, one after the other."""
-    return *first_order_summary(samples), *zeroth_order_summary(samples)
+    """Return the summaries of both estimates."""
+    return first_order_summary(samples), zeroth_order_summary(samples)
 
 
 def both_results(
-    kept: tuple, plan: Plan, baseline: str, restore: Callable
+    summary: tuple, plan: Plan, baseline: str, restore: Callable
 ) -> tuple[GradientEstimate, GradientEstimate]:
     """Return both estimates from the summary of `both_summary`."""
-    return first_order_result(kept[:3], plan, restore), zeroth_order_result(kept[3:], plan, baseline, restore)
+    return first_order_result(summary[0], plan, restore), zeroth_order_result(summary[1], plan, baseline, restore)
 
 
-def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+def _leave_one_out(moments: ScoreMoments) -> tuple[Vector, Vector]:
     r"""Return the mean of $g_i = u_i - b_i \bar s_i$ and its squared error; $b_i$ is the mean cost of the other units.
 
     About the mean cost, $g_i = u_i + p_i/(n-1)$ with the features of `ScoreMoments`. Without pairs $u = p$, and this is
@@ -195,9 +195,7 @@ def _leave_one_out(moments: ScoreMoments) -> tuple[Float[Array, " dim"], Float[A
     return value, spread + (covariance**2 - covariance_spread) / (others**2 + 1)
 
 
-def _mean_and_squared_error(
-    total: Float[Array, " dim"], total_square: Float[Array, " dim"], count: Array
-) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+def _mean_and_squared_error(total: Vector, total_square: Vector, count: Array) -> tuple[Vector, Vector]:
     count = as_real(count, total)
     mean = total / jnp.maximum(count, 1)
     return mean, (total_square - count * mean**2) / jnp.maximum(count * (count - 1), 1)

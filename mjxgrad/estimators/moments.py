@@ -1,14 +1,12 @@
 r"""Moments of samples that arrive in chunks, merged without cancellation.
 
-Each class has `merge`, and is an empty summary when all its leaves are zero. Sums are about the mean of the samples so
-far, never about zero: costs of 1e6 ± 1 would otherwise lose their variance in float32.
+A summary is a pytree of moments and of sums; with all leaves zero it is the summary of no samples. Moments are about the
+mean of the samples so far, never about zero: costs of 1e6 ± 1 would otherwise lose their variance in float32.
 
 References:
     Chan, Golub, LeVeque. Updating formulae and a pairwise algorithm for computing sample
     variances. COMPSTAT 1982, equation 2.1.
 """
-
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,15 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
-class Summary(eqx.Module):
-    """A summary of samples; with all leaves zero it is the summary of none."""
-
-    def merge(self, other: Any) -> Any:
-        """Return the summary of both sets of samples: by default the sums of all leaves."""
-        return jax.tree.map(jnp.add, self, other)
-
-
-class Moments(Summary):
+class Moments(eqx.Module):
     """Count, mean, and sum of squared deviations.
 
     The mean is kept as one of the samples, the origin, and an offset from it. A single float32 number would be off by 0.03
@@ -73,13 +63,7 @@ class Moments(Summary):
         return jnp.where(count > 1, self.squares / jnp.maximum(count * (count - 1), 1), jnp.nan)
 
 
-class Total(Summary):
-    """A sum over all samples: any pytree of arrays."""
-
-    value: PyTree
-
-
-class ScoreMoments(Summary):
+class ScoreMoments(eqx.Module):
     r"""Joint moments of costs and scores that leave the choice of the baseline to the end.
 
     A unit is one sample or an antithetic pair. With costs $f_j$ and scores $s_j$ in a unit and a centre $c$, its
@@ -129,6 +113,15 @@ class ScoreMoments(Summary):
 
     def _moved(self, shift: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
         return _shifted(self.first, shift, 0), _shifted(_shifted(self.second, shift, 0), shift, 1)
+
+
+def merged(one: PyTree, other: PyTree) -> PyTree:
+    """Return the summary of both sets of samples: moments are merged, all other leaves added."""
+
+    def has_merge(leaf: PyTree) -> bool:
+        return isinstance(leaf, Moments | ScoreMoments)
+
+    return jax.tree.map(lambda x, y: x.merge(y) if has_merge(x) else x + y, one, other, is_leaf=has_merge)
 
 
 def as_real(count: Int[Array, "*batch"], like: Float[Array, "..."]) -> Float[Array, "*batch"]:

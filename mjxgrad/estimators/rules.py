@@ -1,7 +1,7 @@
 r"""Rules that weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
-A rule is a function from `Evidence` to `Weights`, both of plain numbers. `alpha_order(..., rule=)` takes any callable, and
-`mg.learning` maps it over steps and actions. $\delta$ is everywhere the probability of *failure*.
+A rule is any function from `Evidence` to `Weights`; `mg.learning` maps it over steps and actions. $\delta$ is everywhere
+the probability of *failure*.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from scipy import stats
 
 from mjxgrad._arrays import is_known
 from mjxgrad.estimators.estimate import Reason
+from mjxgrad.estimators.moments import Moments
 
 
 class Evidence(eqx.Module):
@@ -50,6 +51,16 @@ class Evidence(eqx.Module):
     cost_variance: Float[Array, "*blocks"]
     scaled_first_variance: Float[Array, "*blocks"]
     scaled_first_norm: Float[Array, "*blocks"]
+
+    @classmethod
+    def of(cls, first: Moments, zeroth: Moments, difference: Moments, **facts: Float[Array, ""]) -> "Evidence":
+        """Return the evidence of one block: moments of both parts and of their difference, and facts, NaN if not given."""
+        parts = {"first": first, "zeroth": zeroth, "difference": difference}
+        known = {f"{name}_norm": norm(part.mean) for name, part in parts.items()}
+        known |= {f"{name}_variance": part.variance().sum() for name, part in parts.items()}
+        unknown = dict.fromkeys(cls.__annotations__, jnp.full_like(known["first_norm"], jnp.nan))
+        dim = jnp.ones_like(first.offset).sum()
+        return cls(**{**unknown, **known, **facts, "count": first.count, "dim": dim})
 
     @property
     def real_count(self) -> Float[Array, "*blocks"]:
@@ -177,13 +188,10 @@ class Consistent(eqx.Module):
     The rule asks two questions, the sharper one first:
 
     - Do the derivatives of the samples explain the differences of their costs (see `consistency`)? If a share of more
-      than `threshold` remains unexplained, $\alpha = 0$.
+      than `threshold` remains unexplained, $\alpha = 0$. This finds jumps with few samples and in many dimensions.
     - Does the difference of both parts exceed its own noise, $\|g^1 - g^0\| > \varepsilon$ with failure probability
       $\delta$? The excess $\|g^1 - g^0\|^2 - \varepsilon^2$ is added to the variance of the first order:
       $\alpha = V^0/(V^0 + V^1 + n\,\text{excess})$, the weight of least mean squared error.
-
-    The first question finds jumps with few samples and in many dimensions. The second finds small biases with many
-    samples. Neither needs a constant with a unit.
 
     Attributes:
         threshold: share of the squared secants that may remain unexplained. The bias is then at most the root of this
@@ -214,6 +222,11 @@ class Consistent(eqx.Module):
         return Weights(alpha, reason, alpha * evidence.relative_bias_bound * evidence.first_norm)
 
 
+def norm(vector: Float[Array, "*n"]) -> Float[Array, ""]:
+    """Return the Euclidean norm of a vector, the magnitude of a number."""
+    return jnp.sqrt((vector**2).sum())
+
+
 # Above this, a single coordinate is not the worst case among Gaussian quadratic forms.
 _MOST_FAILURES = 0.2
 _LONGEST_TABLE = 1000
@@ -222,10 +235,9 @@ _LONGEST_TABLE = 1000
 def confidence_radius(
     variance: Float[Array, ""], count: Int[Array, ""], failure_probability: float
 ) -> Float[Array, ""]:
-    """Return a radius that the norm of a mean's error exceeds with the given probability, at most 0.2.
+    """Return a radius that the norm of a mean's error exceeds with the given probability; see `BiasConstrained.bound`.
 
-    The variance is the trace of the covariance of one sample. Fewer than two samples give infinity. See
-    `BiasConstrained.bound`.
+    The variance is the trace of the covariance of one sample. Fewer than two samples give infinity.
     """
     # JAX has no quantile of Student's t, so it comes from a table; beyond the table it is constant to three digits.
     freedom = np.arange(1, _LONGEST_TABLE)

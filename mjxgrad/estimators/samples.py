@@ -1,7 +1,7 @@
 """Rollouts under noise, in chunks, with memory independent of their number.
 
-A rollout is differentiated by the parameters, or by its noise for estimators that compare derivatives with costs. Both ways
-are needed: a long rollout with few parameters is differentiated in forward mode, which the noise of all its actions forbids.
+A rollout is differentiated by its noise for estimators that compare derivatives with costs, else by the parameters: few of
+them allow forward mode.
 """
 
 import dataclasses
@@ -16,9 +16,9 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import one_key, whole
-from mjxgrad.estimators.moments import Summary
+from mjxgrad.estimators.moments import merged
 from mjxgrad.objective import Differentiated, Objective
-from mjxgrad.objective.base import unchanged, value_and_gradient
+from mjxgrad.objective.base import Scalar, Vector, unchanged, value_and_gradient
 
 # Wide enough to fill a CPU's vector units and to hide loop overhead; narrow enough that a chunk of checkpointed rollouts
 # of a small scene takes no more than tens of megabytes.
@@ -30,9 +30,7 @@ GROUP_SIZE = 64
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The rollouts that an estimator asks for.
-
-    A unit is one sample or one pair of samples, independent of all other units.
+    """The rollouts that an estimator asks for; a unit is one sample or one pair, independent of all other units.
 
     Attributes:
         num_samples: number of rollouts with noise.
@@ -129,22 +127,14 @@ class Samples(eqx.Module):
     """Rollouts, by unit and by rollout within the unit.
 
     Attributes:
-        costs: cost of each rollout.
-        gradients: derivatives of the cost by the parameters or by the noise; zero if not asked for.
-        scores: scores by the parameters or by the noise; zero if not asked for.
-        stddevs: standard deviations of the noise; NaN where derivatives are by the parameters.
-        pull_backs: linear maps from components of the noise to parameters.
+        rollouts: the rollouts, differentiated by the noise or by the parameters; zero where it is not asked for.
         is_noisy: False for units that pad the last chunk and for the unit without noise.
         is_noise_free: True for the unit without noise.
         zero_noise_costs: cost of each unit's own rollout without noise; zero if there is none.
         has_no_effect: whether noise that is not zero changed no cost within the unit and all derivatives are zero.
     """
 
-    costs: Float[Array, "units rollouts"]
-    gradients: Float[Array, "units rollouts m"]
-    scores: Float[Array, "units rollouts m"]
-    stddevs: Float[Array, "units rollouts m"]
-    pull_backs: Partial
+    rollouts: Differentiated
     is_noisy: Bool[Array, " units"]
     is_noise_free: Bool[Array, " units"]
     zero_noise_costs: Float[Array, " units"]
@@ -152,29 +142,26 @@ class Samples(eqx.Module):
 
     def first_order_mask(self) -> Bool[Array, " units"]:
         """Return which units a first-order estimate can use."""
-        return self.is_noisy & _all_finite(self.costs) & _all_finite(self.gradients)
+        return self.is_noisy & _all_finite(self.rollouts.cost) & _all_finite(self.rollouts.gradient_by_noise)
 
     def zeroth_order_mask(self) -> Bool[Array, " units"]:
         """Return which units a zeroth-order estimate can use, whatever their gradients."""
-        is_finite = _all_finite(self.costs) & _all_finite(self.scores) & jnp.isfinite(self.zero_noise_costs)
-        return self.is_noisy & is_finite
+        is_finite = _all_finite(self.rollouts.cost) & _all_finite(self.rollouts.noise_score)
+        return self.is_noisy & is_finite & jnp.isfinite(self.zero_noise_costs)
 
-    def noise_free_cost(self) -> Float[Array, ""]:
+    def noise_free_cost(self) -> Scalar:
         """Return the cost without noise if it is in this chunk, else zero."""
-        return jnp.where(self.is_noise_free, self.costs[:, 0], 0).sum()
+        return jnp.where(self.is_noise_free, self.rollouts.cost[:, 0], 0).sum()
 
     def num_felt(self) -> Int[Array, ""]:
         """Return the number of units whose noise made a difference, or cannot tell."""
         return (self.is_noisy & ~self.has_no_effect).sum()
 
 
-def sample(
-    objective: Objective, params: Float[Array, " dim"], key: PRNGKeyArray, plan: Plan, units: Int[Array, " units"]
-) -> Samples:
-    """Roll out some units of a plan under one `jax.vmap`.
+def sample(objective: Objective, params: Vector, key: PRNGKeyArray, plan: Plan, units: Int[Array, " units"]) -> Samples:
+    """Roll out some units of a plan under one `jax.vmap`, the unit `plan.num_units` without noise.
 
-    The noise of unit i comes from `fold_in(key, i)`, so it does not depend on the chunk. The index `plan.num_units` is
-    the rollout without noise. It is part of the batch so that the rollout is compiled only once.
+    The noise of unit i comes from `fold_in(key, i)`, so it does not depend on the chunk.
     """
     one_key(key)
     is_noise_free = (units == plan.num_units) & plan.with_zero_noise
@@ -204,40 +191,27 @@ def sample(
     if plan.zero_noise_per_unit:
         zero_noise_costs = found.cost[:, -1]
         found = jax.tree.map(lambda leaf: leaf[:, :-1], found)
-    return Samples(
-        found.cost,
-        found.gradient_by_noise,
-        found.noise_score,
-        found.noise_stddev,
-        found.pull_back,
-        units < plan.num_units,
-        is_noise_free,
-        zero_noise_costs,
-        is_moved & is_same & is_flat,
-    )
+    has_no_effect = is_moved & is_same & is_flat
+    return Samples(found, units < plan.num_units, is_noise_free, zero_noise_costs, has_no_effect)
 
 
 def stream(
-    objective: Objective,
-    params: Float[Array, " dim"],
-    key: PRNGKeyArray,
-    plan: Plan,
-    summarise: Callable[[Samples], tuple[Summary, ...]],
-) -> tuple[Any, ...]:
-    """Roll out a plan chunk by chunk, and return the merged summaries."""
+    objective: Objective, params: Vector, key: PRNGKeyArray, plan: Plan, summarise: Callable[[Samples], Any]
+) -> Any:
+    """Roll out a plan chunk by chunk, and return the merged summary; see `moments`."""
     num_chunks, size = plan.chunks()
     total = plan.num_units + plan.with_zero_noise
     fewest, num_larger = divmod(total, num_chunks)
     sampled = functools.partial(sample, objective, params, key, plan)
 
     # The start of a chunk is in the carry: an array of all starts would grow with the number of samples.
-    def step(carry: tuple[Int[Array, ""], Int[Array, ""], tuple[Summary, ...]], _: None) -> tuple[tuple, None]:
+    def step(carry: tuple[Int[Array, ""], Int[Array, ""], Any], _: None) -> tuple[tuple, None]:
         chunk, start, kept = carry
         end = start + fewest + (chunk < num_larger)
         units = start + jnp.arange(size)
         # The padding of a chunk is no unit of the plan, nor the rollout without noise.
-        new_ones = summarise(sampled(jnp.where(units < end, units, total)))
-        return (chunk + 1, end, tuple(old.merge(new) for old, new in zip(kept, new_ones, strict=True))), None
+        new = summarise(sampled(jnp.where(units < end, units, total)))
+        return (chunk + 1, end, merged(kept, new)), None
 
     start = jnp.zeros((), int)
     shapes = jax.eval_shape(summarise, jax.eval_shape(sampled, start + jnp.arange(size)))
@@ -248,24 +222,16 @@ def stream(
 class Group(eqx.Module):
     """Samples differentiated by noise that are compared with each other.
 
-    Values that are not finite, or pad a chunk, are zero and masked. With random starts samples 2i and 2i + 1 share one.
+    Values that are not finite, or pad a chunk, are zero and masked by `has_cost` (and `has_derivative`).
 
     Attributes:
-        costs: costs minus `centre`.
-        derivatives: derivatives of the cost by the noise.
-        noise: noise of each sample.
-        scores: scores of the noise.
-        has_cost: whether a sample has a finite cost.
-        has_derivative: whether a sample has a finite cost and derivative.
-        stddev: standard deviation of each component of the noise.
-        centre: mean cost.
+        costs: costs minus their mean, the `centre`.
         rounding: largest magnitude of a cost, the scale of its rounding.
-        per_unit: 2 where pairs share a start, else 1.
+        per_unit: 2 where samples 2i and 2i + 1 share a start, else 1.
     """
 
     costs: Float[Array, "*groups samples"]
     derivatives: Float[Array, "*groups samples m"]
-    noise: Float[Array, "*groups samples m"]
     scores: Float[Array, "*groups samples m"]
     has_cost: Bool[Array, "*groups samples"]
     has_derivative: Bool[Array, "*groups samples"]
@@ -276,13 +242,11 @@ class Group(eqx.Module):
 
     @classmethod
     def of(cls, samples: Samples) -> "Group":
-        per_unit = samples.costs.shape[1]
-        raw, gradients, scores = (
-            leaf.reshape(-1, *leaf.shape[2:]) for leaf in (samples.costs, samples.gradients, samples.scores)
-        )
+        per_unit = samples.rollouts.cost.shape[1]
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), samples.rollouts)
+        raw, gradients = flat.cost, flat.gradient_by_noise
         has_cost = jnp.repeat(samples.is_noisy, per_unit) & jnp.isfinite(raw)
         has_derivative = has_cost & jnp.isfinite(gradients).all(axis=1)
-        stddev = samples.stddevs[0, 0]
         costs = jnp.where(has_cost, raw, 0)
         # Taken about one of the costs first: a mean of large costs is too inexact to subtract.
         origin = costs[jnp.argmax(has_cost)]
@@ -290,15 +254,18 @@ class Group(eqx.Module):
         return cls(
             costs=jnp.where(has_cost, (costs - origin) - offset, 0),
             derivatives=jnp.where(has_derivative[:, None], gradients, 0),
-            noise=scores * stddev**2,
-            scores=scores,
+            scores=flat.noise_score,
             has_cost=has_cost,
             has_derivative=has_derivative,
-            stddev=stddev,
+            stddev=flat.noise_stddev[0],
             centre=origin + offset,
             rounding=jnp.abs(costs).max(),
             per_unit=per_unit,
         )
+
+    @property
+    def noise(self) -> Float[Array, "samples m"]:
+        return self.scores * self.stddev**2
 
     def same_start(self) -> Bool[Array, "samples samples"]:
         """Return which pairs of samples differ only in their noise."""
@@ -318,7 +285,7 @@ class Group(eqx.Module):
 
     def pull_back(self, samples: Samples, by_noise: Float[Array, "samples m"]) -> Float[Array, "samples dim"]:
         """Return each sample's components of the noise, pulled back to the parameters; zero where there is no sample."""
-        pull_backs = jax.tree.map(lambda leaf: leaf.reshape(len(by_noise), *leaf.shape[2:]), samples.pull_backs)
+        pull_backs = jax.tree.map(lambda leaf: leaf.reshape(len(by_noise), *leaf.shape[2:]), samples.rollouts.pull_back)
         by_params = jax.vmap(lambda pull, vector: pull(vector))(pull_backs, by_noise)
         return jnp.where(self.has_cost[:, None], by_params, 0)
 
@@ -332,18 +299,18 @@ class Group(eqx.Module):
             filled = jnp.pad(leaf, [(0, num_groups * size - count)] + [(0, 0)] * (leaf.ndim - 1))
             return filled.reshape(num_groups, size, *leaf.shape[1:])
 
-        own = ("costs", "derivatives", "noise", "scores", "has_cost", "has_derivative")
+        own = ("costs", "derivatives", "scores", "has_cost", "has_derivative")
         shared = ("stddev", "centre", "rounding")
         parts = {name: split(getattr(self, name)) for name in own}
         parts |= {n: jnp.broadcast_to(getattr(self, n), (num_groups, *getattr(self, n).shape)) for n in shared}
         return Group(**parts, per_unit=unit)
 
 
-def _by_parameters(objective: Objective, plan: Plan, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
+def _by_parameters(objective: Objective, plan: Plan, params: Vector, noise: PyTree) -> Differentiated:
     """Roll out once for the score and the derivative by the parameters; what the plan does not ask for is zero."""
     nothing = jnp.zeros_like(params)
 
-    def cost_and_score(at: Float[Array, " dim"]) -> tuple[Float[Array, ""], Array]:
+    def cost_and_score(at: Vector) -> tuple[Scalar, Array]:
         return objective.value_and_score(at, noise) if plan.with_score else (objective.value(at, noise), nothing)
 
     if plan.with_gradient:

@@ -6,9 +6,8 @@ $$\mathbb{E}[(f_j - \beta\, a\cdot w_j - b)\, s_j + \beta\, P_j^\top a] = \nabla
 
 for all $a$, $\beta$ and $b$ that do not depend on $w_j$. The reason: $(a\cdot w_j)s_j$ and $P_j^\top a$ have the same mean,
 where $P_j^\top$ is the pull-back from the noise to the parameters. Here $a$ is the mean derivative of the other samples. It
-removes the linear part of the cost, the source of most of the noise of a zeroth-order estimate. Where derivatives are wrong,
-$\beta$ is near zero and the zeroth-order estimate remains. $a$, $\beta$ and $b$ all leave sample j out, so no samples are
-set aside.
+removes the linear part of the cost, the source of most of the noise of a zeroth-order estimate. The share $\beta$, from 0 to
+1, is fitted by least squares: near zero where derivatives are wrong. $a$, $\beta$ and $b$ all leave sample j out.
 """
 
 import equinox as eqx
@@ -17,6 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjxgrad.estimators.samples import Group
+
+_Pairs = Float[Array, "samples samples"]
 
 
 class UnbiasedTerms(eqx.Module):
@@ -33,12 +34,12 @@ class UnbiasedTerms(eqx.Module):
     linear_variance: Float[Array, ""]
 
 
-def gram(samples: Group) -> Float[Array, "samples samples"]:
+def gram(samples: Group) -> _Pairs:
     """Return the slope of sample i along the noise of sample k, from which all comparisons follow."""
     return jnp.matmul(samples.derivatives, samples.noise.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, with_derivatives: bool) -> UnbiasedTerms:
+def unbiased_terms(samples: Group, slopes: _Pairs, *, with_derivatives: bool) -> UnbiasedTerms:
     """Return the terms of a group; without derivatives, the terms of the zeroth-order estimate.
 
     Terms of samples without a cost are meaningless; the pull-back masks them.
@@ -66,20 +67,17 @@ def unbiased_terms(samples: Group, slopes: Float[Array, "samples samples"], *, w
     return UnbiasedTerms(by_noise, beta, linear_variance)
 
 
-def _fitted_share(
-    samples: Group, slopes: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
-) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
+def _fitted_share(samples: Group, slopes: _Pairs, others: _Pairs) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
-    Up to fourth moments, the variance of the estimate is the variance of the remaining costs times that of the score. The
-    share therefore minimises both.
+    Up to fourth moments, the share that minimises the variance of the remaining costs minimises that of the estimate.
     """
     has_slope = samples.has_derivative.astype(slopes.dtype)
     count = has_slope.sum() - has_slope[:, None] - has_slope[None, :]
     along = (slopes.sum(axis=0)[None, :] - slopes - jnp.diagonal(slopes)[None, :]) / jnp.maximum(count, 1)
     weights = others * (count >= 1)
 
-    def centred(values: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+    def centred(values: _Pairs) -> _Pairs:
         if samples.per_unit == 2:  # the difference within a pair is free of the effect of the start
             return pairs * (values - _partner(values)) / jnp.sqrt(2.0)
         mean = (weights * values).sum(axis=1) / jnp.maximum(weights.sum(axis=1), 1)
@@ -95,14 +93,11 @@ def _fitted_share(
     return jnp.where(has_any, jnp.clip(share, 0, 1), 0), variance
 
 
-def _partner_prediction(
-    samples: Group, rest: Float[Array, "samples samples"], others: Float[Array, "samples samples"]
-) -> Float[Array, " samples"]:
-    """Return the best linear prediction of each remaining cost from its partner's, relative to the mean.
+def _partner_prediction(samples: Group, rest: _Pairs, others: _Pairs) -> Float[Array, " samples"]:
+    """Return the best linear prediction of each remaining cost from that of its partner, relative to the mean.
 
     The partner is the other sample from the same start. The prediction is its distance from the mean times the
-    correlation within the other pairs. Where starts cause most of the spread, the correlation is near one and the
-    baseline is the partner's cost.
+    correlation within the other pairs, near one where starts cause most of the spread.
     """
     both = others * _partner(others)
     covariance = (both * rest * _partner(rest)).sum(axis=1)
@@ -114,6 +109,6 @@ def _partner_prediction(
     return jnp.where(has_partner, correlation * rest[index, partner], 0)
 
 
-def _partner(rows: Float[Array, "samples samples"]) -> Float[Array, "samples samples"]:
+def _partner(rows: _Pairs) -> _Pairs:
     """Return the rows with the two samples of each start swapped."""
     return rows.reshape(len(rows), -1, 2)[:, :, ::-1].reshape(rows.shape)

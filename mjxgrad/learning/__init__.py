@@ -6,13 +6,4 @@ from mjxgrad.learning.learner import Learner, Policy
 from mjxgrad.learning.settings import Settings
 from mjxgrad.loop import Log
 
-__all__ = [
-    "Evaluation",
-    "Learned",
-    "Learner",
-    "Log",
-    "Policy",
-    "Settings",
-    "evaluate",
-    "learn",
-]
+__all__ = ["Evaluation", "Learned", "Learner", "Log", "Policy", "Settings", "evaluate", "learn"]

@@ -1,8 +1,7 @@
 r"""Policies learned from short windows: SHAC, its α-order form, and the likelihood ratio, in one loop.
 
 An update runs one window in every environment (see `window`) and moves the policy along a mixture of both gradients. It then
-fits the value function to TD($\lambda$) targets, and the target value function follows. The methods differ only in the
-mixing rule:
+fits the value function to TD($\lambda$) targets. The methods differ only in the mixing rule:
 
 | `rule` | method |
 |---|---|

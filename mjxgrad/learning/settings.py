@@ -1,4 +1,4 @@
-"""Settings for learning from short windows; the defaults are SHAC's."""
+"""Settings for learning from short windows."""
 
 import dataclasses
 
@@ -15,8 +15,8 @@ class Settings:
         discount: discount per step.
         trace: λ of the returns that the policy climbs, see `window`: 1 differentiates through the whole window, 0 through one
             step and the value function after it.
-        rule: map from the evidence of a step and action to the weight of its first-order gradient. It is asked for each of
-            them. A failure probability of a twentieth would bring in much noise, so the default is smaller.
+        rule: map from the evidence of a step and action to the weight of its first-order gradient. Many are asked, so the
+            default's failure probability is small.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
         actor_layers: hidden sizes of the policy.
         actor_scale: factor of the initial gains of the policy's hidden layers.

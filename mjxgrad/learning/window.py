@@ -85,8 +85,7 @@ class Gradients(eqx.Module):
         """Return first-order gradients of at most `most` zeroth-order root mean squares, and which were shortened.
 
         Through contact a few gradients are a million times longer than the others and dominate the mean of any batch.
-        Gradients as long as zeroth-order noise are no more informative than it. Shortening adds a small bias, which the rules
-        can see.
+        Shortening adds a small bias, which the rules can see.
         """
         norms = jnp.linalg.norm(self.first, axis=-1)
         limit = most * jnp.sqrt((self.zeroth**2).sum(axis=-1).mean(axis=0))
@@ -202,42 +201,21 @@ def window_gradients(
 
 
 def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments steps nu"], Weights, Evidence]:
-    """Mix both gradients by step and action.
+    """Return the mixture of both gradients by step and action, the rule's weights, and the evidence for them.
 
-    Where a first-order gradient is not finite, the zeroth-order one replaces it. The rule maps the evidence of a step and
-    action to its weight. Costs are not compared (`inconsistency` is zero), since no two environments share a start.
-
-    Returns:
-        The mixture, the weights by step and action, and their evidence.
+    Where a first-order gradient is not finite, the zeroth-order one replaces it. Costs are not compared (`inconsistency` is
+    zero), since no two environments share a start.
     """
-    by_step = jax.vmap(Moments.of, in_axes=1)
-    first = by_step(gradients.first, gradients.is_finite)
-    zeroth = by_step(gradients.zeroth, jnp.ones_like(gradients.is_finite))
-    difference = by_step(gradients.zeroth - gradients.first, gradients.is_finite)
-    evidence = _evidence(first, zeroth, difference)
+
+    def found(first: Array, zeroth: Array, is_finite: Array) -> Evidence:
+        everywhere = jnp.ones_like(is_finite)
+        parts = Moments.of(first, is_finite), Moments.of(zeroth, everywhere), Moments.of(zeroth - first, is_finite)
+        return Evidence.of(*parts, inconsistency=jnp.zeros((), first.dtype))
+
+    by_action = jax.vmap(found, in_axes=(1, 1, None))
+    evidence = jax.vmap(by_action, in_axes=1)(gradients.first, gradients.zeroth, gradients.is_finite)
     weights = jax.vmap(jax.vmap(rule))(evidence)
     alpha = jnp.where(evidence.count >= 2, weights.alpha, 0)
     share = jnp.where(gradients.is_finite[..., None], alpha, 0)
     derivative = jnp.where(gradients.is_finite[..., None], gradients.first, 0)
     return share * derivative + (1 - share) * gradients.zeroth, eqx.tree_at(lambda w: w.alpha, weights, alpha), evidence
-
-
-def _evidence(first: Moments, zeroth: Moments, difference: Moments) -> Evidence:
-    """Return the evidence for a rule, for each step and action."""
-    variance = jax.vmap(Moments.variance)
-    zero, unknown = jnp.zeros_like(first.offset), jnp.full_like(first.offset, jnp.nan)
-    return Evidence(
-        count=jnp.broadcast_to(first.count[:, None], zero.shape),
-        dim=jnp.ones_like(zero),
-        first_norm=jnp.abs(first.mean),
-        zeroth_norm=jnp.abs(zeroth.mean),
-        difference_norm=jnp.abs(difference.mean),
-        first_variance=variance(first),
-        zeroth_variance=variance(zeroth),
-        difference_variance=variance(difference),
-        inconsistency=zero,
-        relative_bias_bound=unknown,
-        cost_variance=unknown,
-        scaled_first_variance=unknown,
-        scaled_first_norm=unknown,
-    )

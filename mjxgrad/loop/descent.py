@@ -18,6 +18,7 @@ from mjxgrad._programs import compile_once
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
 from mjxgrad.loop.run import Log, Method, Progress, mean
+from mjxgrad.objective.base import Scalar, Vector
 
 # Progress is shown every five per cent; each time costs one return from the device.
 NUM_SEGMENTS = 20
@@ -44,7 +45,7 @@ class RunOptions(eqx.Module):
     """
 
     num_steps: int
-    evaluate: Callable[[Float[Array, " dim"]], Float[Array, ""]] | None = None
+    evaluate: Callable[[Vector], Scalar] | None = None
     evaluate_every: int = 10
     patience: int = 10
     log: Log | None = None
@@ -59,26 +60,19 @@ class RunOptions(eqx.Module):
 
 
 class Carry(eqx.Module):
-    """The state of one run between two steps.
+    """The state of one run between two steps; see also `Optimisation`.
 
     Attributes:
-        params: parameters.
         state: the method's own state.
         key: key of the run; the noise of a step comes from it and the number of the step.
-        best: best parameters so far.
-        num_steps: steps done, those not taken included.
-        num_skipped: steps not taken.
         num_in_a_row: length of the present row of steps not taken.
         num_still: length of the present row of steps that felt nothing.
-        stopped: an item of `Stopped`.
     """
 
-    params: Float[Array, " dim"]
+    params: Vector
     state: PyTree
     key: PRNGKeyArray
     best: Best
-    num_steps: Int[Array, ""]
-    num_skipped: Int[Array, ""]
     num_in_a_row: Int[Array, ""]
     num_still: Int[Array, ""]
     stopped: Stopped
@@ -90,7 +84,7 @@ class Descent(Method):
     options: RunOptions
 
     @abstractmethod
-    def init_state(self, params: Float[Array, " dim"]) -> PyTree:
+    def init_state(self, params: Vector) -> PyTree:
         """Return the first state of the method, carried from step to step beside the parameters."""
 
     def begun(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> dict[str, Any]:
@@ -125,24 +119,19 @@ class Descent(Method):
             **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint")},
         }
 
-    def init(self, start: tuple[Float[Array, " dim"], PRNGKeyArray]) -> Carry:
+    def init(self, start: tuple[Vector, PRNGKeyArray]) -> Carry:
         params, key = start
         nan = jnp.full((), jnp.nan, params.dtype)
         best = Best(params, nan, nan + jnp.inf, nan)
         zero, stopped = jnp.zeros((), jnp.int32), jax.tree.map(jnp.asarray, Stopped.running)
-        return Carry(params, self.init_state(params), key, best, zero, zero, zero, zero, stopped)
+        return Carry(params, self.init_state(params), key, best, zero, zero, stopped)
 
     def moved(
-        self, carry: Carry, index: Int[Array, ""], params: Float[Array, " dim"], state: PyTree, record: Record
-    ) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+        self, carry: Carry, index: Int[Array, ""], params: Vector, state: PyTree, record: Record
+    ) -> tuple[Carry, tuple[Record, Scalar]]:
         """Return the carry after a step, and the record of the step; nothing changes where a run has stopped.
 
-        Args:
-            carry: carry before the step.
-            index: number of the step.
-            params: parameters after the step; unchanged, with `record.is_taken` False, if it could not be taken.
-            state: state after the step; unchanged if it could not be taken.
-            record: record of the step.
+        `params` and `state` are those after the step; unchanged, with `record.is_taken` False, if it could not be taken.
         """
         options, at, nan = self.options, carry.params, jnp.full((), jnp.nan, carry.params.dtype)
         noise_free, candidate = nan, Best(at, record.cost, record.scale, record.finite_fraction)
@@ -157,10 +146,8 @@ class Descent(Method):
         enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
         stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, stopped)
         stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
-        num_skipped, best = carry.num_skipped + ~record.is_taken, carry.best.against(candidate)
-        after = Carry(
-            params, state, carry.key, best, carry.num_steps + 1, num_skipped, num_in_a_row, num_still, stopped
-        )
+        best = carry.best.against(candidate)
+        after = Carry(params, state, carry.key, best, num_in_a_row, num_still, stopped)
         # One of several runs may have stopped before the others.
         as_it_was, as_it_is = (carry, (Record.blank(at.dtype), nan)), (after, (record, noise_free))
         return jax.tree.map(lambda old, new: jnp.where(self.is_over(carry), old, new), as_it_was, as_it_is)
@@ -180,11 +167,12 @@ class Descent(Method):
     def result(self, progress: Progress) -> Optimisation:
         carry, history = progress.carry, History.of(progress)
         best, final_cost = carry.best, jnp.full_like(carry.best.cost, jnp.nan)
+        was_done = np.isfinite(history.scale)  # NaN in steps that did not happen
         if self.options.evaluate is not None:
             arrays, static = eqx.partition(self.options.evaluate, eqx.is_array)
             numbers, structure = jax.tree.flatten(arrays)
 
-            def finish(numbers: list[Array], at: Float[Array, " dim"], best: Best) -> tuple[Float[Array, ""], Best]:
+            def finish(numbers: list[Array], at: Vector, best: Best) -> tuple[Scalar, Best]:
                 cost = jnp.asarray(eqx.combine(jax.tree.unflatten(structure, numbers), static)(at), at.dtype)
                 return cost, best.against(Best.measured(at, cost))  # the last point competes with the best before
 
@@ -197,8 +185,8 @@ class Descent(Method):
             final_cost=final_cost,
             history=history,
             stopped=carry.stopped,
-            num_steps=np.asarray(carry.num_steps),
-            num_skipped=np.asarray(carry.num_skipped),
+            num_steps=np.asarray(was_done.sum(axis=-1)),
+            num_skipped=np.asarray((was_done & ~history.is_taken).sum(axis=-1)),
             num_rollouts=history.num_rollouts[..., -1],
             num_gradient_rollouts=history.num_gradient_rollouts[..., -1],
             seconds=float(progress.seconds.sum()),

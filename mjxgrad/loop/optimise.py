@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
 from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective, flattened, of_vector
-from mjxgrad.objective.base import as_objective
+from mjxgrad.objective.base import Scalar, Vector, as_objective
 from mjxgrad.objective.parameters import Restored
 
-AnnealedObjective = Callable[[Float[Array, ""]], Objective]
+AnnealedObjective = Callable[[Scalar], Objective]
 Annealing = Callable[[ArrayLike], ArrayLike]
 """A schedule from the number of a step to a scale in (0, 1]."""
 
@@ -41,8 +41,7 @@ def optimise(
     five seeds in one program. Step number n of a run draws its noise from `fold_in(key, n)`.
 
     A step whose estimate is not finite is not taken: parameters and optimiser stay unchanged, `num_skipped` counts the
-    step, and the next one draws other noise. The run stops with `Stopped.nothing_felt` if for a few steps all samples cost
-    the same and no derivative differs from zero, for instance because a policy touches nothing.
+    step, and the next one draws other noise. The run stops where nothing is felt, see `Stopped`.
 
     With annealing, smoothing decreases as the run converges: `objective` is then a function of a traced scale in
     (0, 1], and `annealing` is the schedule of the scale.
@@ -118,10 +117,10 @@ class GradientStep(Descent):
         """The optimiser; it accepts the cost as `value`, as `reduce_on_plateau` needs it."""
         return optax.with_extra_args_support(self.optimiser)
 
-    def init_state(self, params: Float[Array, " dim"]) -> PyTree:
+    def init_state(self, params: Vector) -> PyTree:
         return jax.tree.map(jnp.asarray, self.transformation.init(params))
 
-    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
         scale, objective = self.annealed(self.objective, carry.params, index)
         estimate = self.estimator(objective, carry.params, jax.random.fold_in(carry.key, index))
         change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
@@ -129,8 +128,8 @@ class GradientStep(Descent):
         return self.moved(carry, index, carry.params + change, state, record)
 
     def annealed(
-        self, objective: Objective | AnnealedObjective, params: Float[Array, " dim"], step: Int[Array, ""]
-    ) -> tuple[Float[Array, ""], Objective]:
+        self, objective: Objective | AnnealedObjective, params: Vector, step: Int[Array, ""]
+    ) -> tuple[Scalar, Objective]:
         """Return the scale of a step, 1 without annealing, and the objective at this scale."""
         if self.annealing is None:
             return jnp.ones((), params.dtype), as_objective(objective)
@@ -138,16 +137,11 @@ class GradientStep(Descent):
         return scale, objective if isinstance(objective, Objective) else objective(scale)
 
     def change(
-        self,
-        params: Float[Array, " dim"],
-        state: PyTree,
-        estimate: GradientEstimate,
-        gradient: Float[Array, " dim"],
-    ) -> tuple[Float[Array, " dim"], PyTree, Bool[Array, ""]]:
+        self, params: Vector, state: PyTree, estimate: GradientEstimate, gradient: Vector
+    ) -> tuple[Vector, PyTree, Bool[Array, ""]]:
         """Return the optimiser's change of the parameters, its state after, and whether the step is taken.
 
-        The gradient is the sum of the estimate and of the gradient of anything else in the cost. A step that would not
-        be finite is not taken: the change is zero and the state stays unchanged.
+        The gradient is the sum of the estimate and of the gradient of anything else in the cost.
         """
         is_finite = jnp.isfinite(gradient).all()
         # NaN must not reach the optimiser: its behaviour is then undefined, even if the result is discarded.
@@ -160,19 +154,16 @@ class GradientStep(Descent):
 
 
 class EstimatedGradientState(eqx.Module):
-    """The state of `estimated_gradient`.
+    """The state of `estimated_gradient`: counts of updates and of those that were not finite, and the optimiser's state.
 
     Attributes:
-        step: number of updates so far; the noise of an update comes from it.
-        num_skipped: number of updates that were not finite and therefore zero.
         scale: scale of the annealing at the last update.
         estimate: last estimate, as a vector; all NaN before the first update.
-        inner: state of the optimiser.
     """
 
     step: Int[Array, ""]
     num_skipped: Int[Array, ""]
-    scale: Float[Array, ""]
+    scale: Scalar
     estimate: GradientEstimate
     inner: PyTree
 
@@ -194,9 +185,8 @@ def estimated_gradient(
             params = optax.apply_updates(params, change)
         state.estimate  # the last one, with its error bars
 
-    Update number n draws its noise from `fold_in(key, n)`, as in `optimise`, so both give the same trajectory. The
-    arguments are those of `optimise`. With `optimiser` None the update is the gradient itself, to be chained with other
-    transformations.
+    Arguments and noise are those of `optimise`, so both give the same trajectory. With `optimiser` None the update is the
+    gradient itself, to be chained with other transformations.
 
     Returns:
         A transformation of a vector, or of a pytree as in `optimise`. The updates that it is given are added to the
@@ -208,33 +198,25 @@ def estimated_gradient(
     """
     rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
-    def init(params: PyTree) -> EstimatedGradientState:
+    def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Scalar, GradientEstimate]:
         vector, restore = flattened(params)
+        scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
+        return scale, jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, step)))
 
-        def first(
-            vector: Float[Array, " dim"], key: PRNGKeyArray, step: Int[Array, ""]
-        ) -> tuple[Float[Array, ""], GradientEstimate]:
-            scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
-            return scale, estimator(annealed, vector, key)
-
+    def init(params: PyTree) -> EstimatedGradientState:
         zero = jnp.zeros((), jnp.int32)
-        shapes = jax.eval_shape(first, vector, key, zero)
+        shapes = jax.eval_shape(lambda step: estimated(params, step), zero)
         nothing = lambda x: jnp.full(x.shape, jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else 0, x.dtype)  # noqa: E731
         scale, estimate = jax.tree.map(nothing, shapes)
-        return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(vector))
+        return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(flattened(params)[0]))
 
     def update(
-        updates: PyTree,
-        state: EstimatedGradientState,
-        params: PyTree = None,
-        **unused: Any,
+        updates: PyTree, state: EstimatedGradientState, params: PyTree = None, **_: Any
     ) -> tuple[PyTree, EstimatedGradientState]:
-        del unused  # extra arguments of others in a chain
         if params is None:
             raise ValueError("params must be given to update, got None: the gradient is estimated there")
         vector, restore = flattened(params)
-        scale, annealed = rule.annealed(of_vector(objective, restore), vector, state.step)
-        estimate = jax.tree.map(jnp.asarray, estimator(annealed, vector, jax.random.fold_in(key, state.step)))
+        scale, estimate = estimated(params, state.step)
         gradient = estimate.value if updates is None else estimate.value + flattened(updates)[0]
         change, inner, is_taken = rule.change(vector, state.inner, estimate, gradient)
         moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)

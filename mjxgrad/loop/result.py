@@ -132,8 +132,7 @@ class History(Record):
 
     Attributes:
         noise_free_cost: result of `evaluate` at the parameters before the step, NaN where it was not due.
-        seconds: wall-clock time up to the end of the step, without compilation, the same for all seeds. It is measured
-            per segment and divided evenly among the steps of the segment.
+        seconds: wall-clock time up to the end of the step, the same for all seeds; see `Progress`.
     """
 
     noise_free_cost: Float[np.ndarray, "..."]
@@ -141,7 +140,7 @@ class History(Record):
 
     @classmethod
     def of(cls, progress: Progress) -> "History":
-        """Return the history from the records of a descent, with cumulative counts and seconds."""
+        """Return the history from the records of a descent."""
         records, noise_free_cost = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), progress.found)
         fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
         for name in ("num_rollouts", "num_gradient_rollouts"):

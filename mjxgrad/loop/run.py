@@ -1,7 +1,6 @@
 """The loop that every method runs in: steps on the device in segments; logs and checkpoints between them.
 
-A method is two functions, from a start to a carry and from a carry to the next; the carry is any pytree. Descents (`descent`)
-are methods with a vector of parameters. Learning a policy is a method, too (`mjxgrad.learning`).
+A method is two functions, from a start to a carry and from a carry to the next; the carry is any pytree.
 """
 
 import functools
@@ -32,7 +31,7 @@ class Progress(NamedTuple):
     Attributes:
         carry: carry after the last step.
         found: records of the steps, in NumPy, with the steps on the first axis.
-        seconds: wall-clock time of each step. It is measured per segment and divided evenly among its steps.
+        seconds: wall-clock time of each step, without compilation, measured per segment and divided among its steps.
         compile_seconds: time of tracing and compilation in this session.
     """
 
@@ -145,7 +144,12 @@ def run(
     steps = jax.jit(_steps(step, traced.out_info[1], method.is_over, segment), out_shardings=sharding)
     nothing = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), traced.out_info[1])
     progress = Progress(carry, nothing, np.zeros(0), time.perf_counter() - began)
-    identity = {} if checkpoint is None else _identity(method, start, numbers, traced.lower().as_text())
+    identity = {}
+    if checkpoint is not None:
+        # Classes of one name may differ in code. The lowered program has every number that is no argument, such as a rate.
+        text = np.frombuffer(traced.lower().as_text().encode(), np.uint8)
+        parts = {"start": start, "arrays": numbers, "program": text}
+        identity = method.identity() | {name: checkpoints.digest(part) for name, part in parts.items()}
     if checkpoint is not None and checkpoint.exists():
         carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
         progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
@@ -168,17 +172,6 @@ def run(
         if checkpoint is not None and is_first and progress.num_steps > on_disk:
             checkpoints.save(checkpoint, progress[:3], identity)
     return method.result(progress)
-
-
-def _identity(method: Method, start: PyTree, numbers: list[Array], program: str) -> dict[str, Any]:
-    """Return the fingerprint that a resumed run must share; a class of the same name may have other code."""
-    return {
-        **method.identity(),
-        "start": checkpoints.digest(start),
-        "arrays": checkpoints.digest(numbers),
-        # The lowered program contains every number that is not an argument, such as a learning rate.
-        "program": checkpoints.digest(np.frombuffer(program.encode(), np.uint8)),
-    }
 
 
 def mean(values: Shaped[np.ndarray, "..."]) -> float:

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
+    Scalar,
+    Vector,
     as_scalar,
     gaussian,
     positive,
@@ -22,25 +24,25 @@ from mjxgrad.objective.base import (
     value_and_gradient,
 )
 from mjxgrad.objective.parameters import flattened
-from mjxgrad.objective.task import Outcome, Task, as_pytree
+from mjxgrad.objective.task import Outcome, Policy, Task, as_pytree
 
 
 class ActionNoise(Objective):
     """The common part of open loop and closed loop.
 
-    The noise of a rollout is the noise of its actions, or the pair of action noise and start where the task has a
-    distribution of starts. The start does not depend on the parameters, so it adds nothing to the score.
+    The noise of a rollout is that of its actions, or the pair of it and a start where the task has a distribution of
+    starts. The start does not depend on the parameters, so it adds nothing to the score.
     """
 
     task: eqx.AbstractVar[Task]
     stddev: eqx.AbstractVar[Float[Array, "..."]]
 
     @abstractmethod
-    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        """Roll out once; return the cost, the states, and the costs by step where the task gives them."""
+    def controls(self, params: Vector) -> tuple[Any, PyTree]:
+        """Return the first arguments of the task's `run`: controls or policy, and the policy's parameters."""
 
     @abstractmethod
-    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+    def pull_back_at(self, params: Vector, states: PyTree) -> Partial:
         """Return the pull-back from components by action noise, flattened, to the parameters; see `Differentiated`."""
 
     @property
@@ -89,7 +91,13 @@ class ActionNoise(Objective):
         """Return the action noise and the start, None where the start is not random."""
         return noise if isinstance(noise, tuple) else (noise, None)
 
-    def value(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, ""]:
+    def outcome(self, params: Vector, noise: PyTree) -> Outcome:
+        """Roll out once; return the cost, the states, and the costs by step where the task gives them."""
+        actions, start = self.split(noise)
+        outcome = self.task.run(*self.controls(params), actions.astype(params.dtype), start)
+        return dataclasses.replace(outcome, cost=as_scalar(outcome.cost, "the task's cost"))
+
+    def value(self, params: Vector, noise: PyTree) -> Scalar:
         return self.outcome(params, noise).cost
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ActionNoise":
@@ -98,19 +106,18 @@ class ActionNoise(Objective):
     def _start_shape(self) -> PyTree:
         return jax.eval_shape(self.task.sample_start, jax.random.key(0))
 
-    def _noise_score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " m"]:
+    def _noise_score(self, params: Vector, noise: PyTree) -> Float[Array, " m"]:
         actions, _ = self.split(noise)
         return jnp.ravel(actions / self.stddev**2).astype(params.dtype)
 
-    def differentiate(self, params: Float[Array, " dim"], noise: PyTree) -> Differentiated:
+    def differentiate(self, params: Vector, noise: PyTree) -> Differentiated:
         """Differentiate by the action noise through the whole loop, in one reverse pass.
 
-        The total derivatives of the cost by the noise of an action and by the action itself are equal. The parameters
-        affect the cost only through the actions. The pull-back at the visited states therefore gives their whole gradient.
+        The parameters affect the cost only through the actions, so the pull-back of this derivative is their gradient.
         """
         actions, start = self.split(noise)
 
-        def cost_and_states(flat: Float[Array, " m"]) -> tuple[Float[Array, ""], PyTree]:
+        def cost_and_states(flat: Float[Array, " m"]) -> tuple[Scalar, PyTree]:
             shaped = flat.reshape(self.noise_shape)
             outcome = self.outcome(params, shaped if start is None else (shaped, start))
             return outcome.cost, outcome.states
@@ -129,22 +136,21 @@ class OpenLoop(ActionNoise):
     stddev: Float[Array, "..."]
     dim: int | None = eqx.field(static=True)
 
-    def ravel(self, controls: Float[Array, "horizon nu"]) -> Float[Array, " dim"]:
+    def ravel(self, controls: Float[Array, "horizon nu"]) -> Vector:
         """Return controls as a vector of parameters."""
         return jnp.ravel(controls)
 
-    def unravel(self, params: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
+    def unravel(self, params: Vector) -> Float[Array, "horizon nu"]:
         """Return parameters in the shape of controls."""
         return params.reshape(self.noise_shape)
 
-    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        actions, start = self.split(noise)
-        return _checked(self.task.run(self.unravel(params), noise=actions.astype(params.dtype), start=start))
+    def controls(self, params: Vector) -> tuple[Any, PyTree]:
+        return self.unravel(params), None
 
-    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
+    def score(self, params: Vector, noise: PyTree) -> Vector:
         return self._noise_score(params, noise)
 
-    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+    def pull_back_at(self, params: Vector, states: PyTree) -> Partial:
         return Partial(unchanged)  # the parameters are the controls
 
 
@@ -152,30 +158,27 @@ class ClosedLoop(ActionNoise):
     """The cost of a task under a policy with noise on its actions; see `closed_loop`."""
 
     task: Task
-    policy: Callable[[PyTree, Any], Float[Array, " nu"]]
+    policy: Policy
     stddev: Float[Array, "..."]
-    unravel: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
+    unravel: Callable[[Vector], PyTree] = eqx.field(static=True)
     dim: int | None = eqx.field(static=True)
 
-    def ravel(self, policy_params: PyTree) -> Float[Array, " dim"]:
+    def ravel(self, policy_params: PyTree) -> Vector:
         """Return the policy's parameters as a vector."""
         return _flat(policy_params)[0]
 
-    def outcome(self, params: Float[Array, " dim"], noise: PyTree) -> Outcome:
-        actions, start = self.split(noise)
-        return _checked(self.task.run(self.policy, self.unravel(params), actions.astype(params.dtype), start))
+    def controls(self, params: Vector) -> tuple[Any, PyTree]:
+        return self.policy, self.unravel(params)
 
-    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
+    def score(self, params: Vector, noise: PyTree) -> Vector:
         """Return Σ_t (∂π(x_t)/∂θ)ᵀ w_t/σ²; it takes a rollout."""
         return self.value_and_score(params, noise)[1]
 
-    def value_and_score(
-        self, params: Float[Array, " dim"], noise: PyTree
-    ) -> tuple[Float[Array, ""], Float[Array, " dim"]]:
+    def value_and_score(self, params: Vector, noise: PyTree) -> tuple[Scalar, Vector]:
         outcome = self.outcome(params, noise)
         return outcome.cost, self.pull_back_at(params, outcome.states)(self._noise_score(params, noise))
 
-    def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
+    def pull_back_at(self, params: Vector, states: PyTree) -> Partial:
         # Given the state, the action is Gaussian about the policy; given state and action, the distribution of the next
         # state does not depend on the parameters. The states are therefore data here.
         states = jax.lax.stop_gradient(states)
@@ -204,11 +207,7 @@ def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
 
 
 def closed_loop(
-    task: Task,
-    policy: Callable[[PyTree, Any], Float[Array, " nu"]],
-    stddev: float | Float[Array, "..."],
-    *,
-    params: PyTree = None,
+    task: Task, policy: Policy, stddev: float | Float[Array, "..."], *, params: PyTree = None
 ) -> ClosedLoop:
     r"""Return the cost of a task as a function of a policy's parameters, with noise on its actions.
 
@@ -236,7 +235,7 @@ def closed_loop(
     return ClosedLoop(task=task, policy=as_pytree(policy), stddev=stddev, unravel=unravel, dim=dim)
 
 
-def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
+def _flat(params: PyTree) -> tuple[Vector, Callable[[Vector], PyTree]]:
     if all(map(eqx.is_array_like, jax.tree.leaves(params))):
         return ravel_pytree(params)  # its `unravel` equals that of any pytree of the same structure
     vector, restore = flattened(params)
@@ -248,28 +247,17 @@ def _flat(params: PyTree) -> tuple[Float[Array, " dim"], Callable[[Float[Array, 
 class _ActionsTranspose:
     """The transpose of the derivative of the mean actions by the parameters, at given states.
 
-    It is a class because equal settings must give equal pytrees, and two closures are never equal. It evaluates the policy
-    again because the residuals of `jax.vjp` would be a different pytree in each trace.
+    Equal settings must give equal pytrees, which two closures never are, nor the residuals of two traces of `jax.vjp`.
     """
 
-    unravel: Callable[[Float[Array, " dim"]], PyTree]
+    unravel: Callable[[Vector], PyTree]
 
-    def __call__(
-        self,
-        policy: Callable[[PyTree, Any], Float[Array, " nu"]],
-        params: Float[Array, " dim"],
-        states: PyTree,
-        by_actions: Float[Array, " m"],
-    ) -> Float[Array, " dim"]:
-        def actions(flat: Float[Array, " dim"]) -> Float[Array, " m"]:
+    def __call__(self, policy: Policy, params: Vector, states: PyTree, by_actions: Float[Array, " m"]) -> Vector:
+        def actions(flat: Vector) -> Float[Array, " m"]:
             return jnp.ravel(jax.vmap(lambda state: policy(self.unravel(flat), state))(states))
 
         _, transpose = jax.vjp(actions, params)
         return transpose(by_actions)[0]
-
-
-def _checked(outcome: Outcome) -> Outcome:
-    return dataclasses.replace(outcome, cost=as_scalar(outcome.cost, "the task's cost"))
 
 
 def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:

@@ -14,6 +14,8 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
+    Scalar,
+    Vector,
     as_objective,
     as_scalar,
     gaussian,
@@ -27,35 +29,33 @@ from mjxgrad.objective.task import as_pytree
 class ParameterNoise(Objective):
     r"""$f(\theta + w)$ with $w \sim N(0, \mathrm{stddev}^2)$ on the parameters; see `parameter_noise`."""
 
-    function: Callable[[Any], Float[Array, ""]]
+    function: Callable[[Any], Scalar]
     stddev: Float[Array, " *dim"]
     dim: int | None = eqx.field(static=True)
 
-    def sample_noise(self, key: PRNGKeyArray) -> Float[Array, " dim"]:
+    def sample_noise(self, key: PRNGKeyArray) -> Vector:
         if self.dim is None:
             raise ValueError("dim is not known: pass dim=... to parameter_noise")
         return gaussian(key, self.stddev, (self.dim,))
 
-    def value(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Float[Array, ""]:
+    def value(self, params: Vector, noise: Vector) -> Scalar:
         return as_scalar(self.function(params + noise.astype(params.dtype)), "function")
 
-    def score(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    def score(self, params: Vector, noise: Vector) -> Vector:
         return (noise / self.stddev**2).astype(params.dtype)
 
-    def differentiate(self, params: Float[Array, " dim"], noise: Float[Array, " dim"]) -> Differentiated:
+    def differentiate(self, params: Vector, noise: Vector) -> Differentiated:
         cost, gradient = value_and_gradient(self.function, params + noise.astype(params.dtype))
         stddev = jnp.broadcast_to(self.stddev, params.shape).astype(params.dtype)
         return Differentiated(cost, gradient, self.score(params, noise), stddev, Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ParameterNoise":
-        stddev, dim = _fitting(stddev, self.dim)
-        return dataclasses.replace(self, stddev=stddev, dim=dim)
+        new = parameter_noise(self.function, stddev, self.dim)
+        return dataclasses.replace(self, stddev=new.stddev, dim=new.dim)
 
 
 def parameter_noise(
-    function: Callable[[Any], Float[Array, ""]],
-    stddev: float | Float[Array, ""] | Float[Array, " dim"],
-    dim: int | None = None,
+    function: Callable[[Any], Scalar], stddev: float | Float[Array, "*dim"], dim: int | None = None
 ) -> ParameterNoise:
     r"""Smooth any function of parameters by Gaussian noise on them.
 
@@ -72,25 +72,25 @@ def parameter_noise(
     Raises:
         ValueError: if `stddev` is not positive, or neither one number nor `dim` of them.
     """
-    stddev, dim = _fitting(stddev, dim)
-    return ParameterNoise(function=as_pytree(function), stddev=stddev, dim=dim)
+    width = positive(stddev)
+    if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
+        raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
+    dim = width.shape[0] if width.ndim == 1 else dim
+    return ParameterNoise(function=as_pytree(function), stddev=width, dim=dim)
 
 
 class Restored(eqx.Module):
     """A function of a pytree of parameters, as a function of their vector."""
 
     function: Callable[[PyTree], Any]
-    restore: Callable[[Float[Array, " dim"]], PyTree] = eqx.field(static=True)
+    restore: Callable[[Vector], PyTree] = eqx.field(static=True)
 
-    def __call__(self, vector: Float[Array, " dim"]) -> Any:
+    def __call__(self, vector: Vector) -> Any:
         return self.function(self.restore(vector))
 
 
 def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return the floating-point arrays of a pytree as a vector, with its inverse; or an array unchanged, with None.
-
-    The inverse also takes one vector per seed.
-    """
+    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; or an array, None."""
     if eqx.is_array_like(params):
         return jnp.asarray(params), None
     # `is_inexact_array_like` calls a tracer's `__jax_array__`, which is None (jax 0.10.2, equinox 0.13.8).
@@ -106,7 +106,7 @@ def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Arra
     return vector, restore
 
 
-def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] | None) -> Any:
+def of_vector(objective: Any, restore: Callable[[Vector], PyTree] | None) -> Any:
     """Return an objective, or a function from a scale to one, that takes the vector of `flattened`.
 
     An objective with noise on actions is unchanged: it takes a vector already, and restores its policy's parameters itself.
@@ -118,23 +118,10 @@ def of_vector(objective: Any, restore: Callable[[Float[Array, " dim"]], PyTree] 
     return lambda scale: of_vector(objective(scale), restore)
 
 
-def as_vector(
-    objective: Objective, params: PyTree
-) -> tuple[Objective, Float[Array, " dim"], Callable[[Float[Array, " dim"]], PyTree]]:
-    """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form.
-
-    The latter has None in place of leaves that are no floating-point arrays.
-    """
+def as_vector(objective: Objective, params: PyTree) -> tuple[Objective, Vector, Callable[[Vector], PyTree]]:
+    """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form."""
     vector, restore = flattened(params)
     objective = of_vector(as_objective(objective), restore).sized_for(vector)
     if restore is None:
         return objective, vector, unchanged
     return objective, vector, lambda gradient: eqx.filter(restore(gradient), eqx.is_inexact_array)
-
-
-def _fitting(stddev: float | Float[Array, "..."], dim: int | None) -> tuple[Float[Array, "*dim"], int | None]:
-    """Return the standard deviation as an array, and the number of parameters, `dim` or its length."""
-    stddev = positive(stddev)
-    if stddev.ndim > 1 or (stddev.ndim == 1 and dim not in (None, stddev.shape[0])):
-        raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {stddev.shape}")
-    return stddev, stddev.shape[0] if stddev.ndim == 1 else dim

@@ -1,4 +1,4 @@
-"""The linear policy from states to controls, with separate parameters."""
+"""The linear policy from states to controls."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,28 +12,18 @@ from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 
 
-class Affine(eqx.Module):
-    """A linear map by a matrix, the gain, with an optional offset."""
-
-    gain: Float[Array, "outputs inputs"]
-    offset: Float[Array, " outputs"] | None
-
-    def __call__(self, inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-        if inputs.shape != self.gain.shape[1:]:
-            raise ValueError(
-                f"the policy must observe {self.gain.shape[1]} numbers, got shape {inputs.shape}; "
-                "set num_states, or observe"
-            )
-        return self.gain @ inputs if self.offset is None else self.gain @ inputs + self.offset
-
-
 class LinearPolicy(eqx.Module):
     """The policy of `linear_policy`: its parameters are a map of what it observes."""
 
     observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
 
-    def __call__(self, params: Affine, state: Any) -> Float[Array, " nu"]:
-        return params(self.observe(state))
+    def __call__(self, params: eqx.nn.Linear, state: Any) -> Float[Array, " nu"]:
+        seen, size = self.observe(state), params.weight.shape[1]
+        if seen.shape != (size,):
+            raise ValueError(
+                f"the policy must observe {size} numbers, got shape {seen.shape}; set num_states, or observe"
+            )
+        return params(seen)
 
 
 def whole_state(state: Any) -> Float[Array, " observed"]:
@@ -51,8 +41,8 @@ def linear_policy(
     *,
     bias: bool = True,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
-) -> tuple[LinearPolicy, Affine]:
-    """Return the policy u = K x + k, with parameters that are zero.
+) -> tuple[LinearPolicy, eqx.nn.Linear]:
+    """Return the policy u = K x + k, with parameters that are zero: K is their `weight`, k their `bias`.
 
         policy, params = linear_policy(4, 1)
         objective = closed_loop(task, policy, stddev=0.1, params=params)
@@ -75,5 +65,5 @@ def linear_policy(
     for name, number in (("num_states", num_states), ("num_controls", num_controls)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
-    offset = jnp.zeros(num_controls) if bias else None
-    return LinearPolicy(observe), Affine(jnp.zeros((num_controls, num_states)), offset)
+    drawn = eqx.nn.Linear(num_states, num_controls, use_bias=bias, key=jax.random.key(0))
+    return LinearPolicy(observe), jax.tree.map(jnp.zeros_like, drawn)

@@ -3,7 +3,7 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -35,8 +35,7 @@ class Outcome(eqx.Module):
 class Task(eqx.Module):
     """A map from controls to a cost; its dynamics need not be MuJoCo's.
 
-    A subclass gives `horizon`, `num_controls` and `run`. If rollouts may start in different states it also gives
-    `nominal_start`, and if the start is random `sample_start`.
+    A subclass gives `horizon`, `num_controls` and `run`; with random starts also `nominal_start` and `sample_start`.
     """
 
     horizon: eqx.AbstractVar[int]
@@ -71,16 +70,10 @@ class Task(eqx.Module):
         return None
 
 
-def as_pytree(function: Callable) -> Callable:
-    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap."""
-    if isinstance(function, eqx.Module | jax.tree_util.Partial):
-        return function  # pyright: ignore[reportReturnType]
-    return jax.tree_util.Partial(function)
-
-
-def optional_pytree(function: Callable | None) -> Callable | None:
-    """Return a function as a pytree, see `as_pytree`, or None."""
-    return None if function is None else as_pytree(function)
+def as_pytree(function: Any) -> Any:
+    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap; None stays None."""
+    is_one = function is None or isinstance(function, eqx.Module | jax.tree_util.Partial)
+    return function if is_one else jax.tree_util.Partial(function)
 
 
 # Not typing.Self, which beartype refuses in methods that are checked one by one.
@@ -92,8 +85,7 @@ class InScene(eqx.Module):
 
     Attributes:
         scene: the scene, from `load_scene`.
-        contact: how contact is stepped, see `rollout`; by default with the derivative that descents need, the slope of the
-            outcome. A sweep over its lengths is one `jax.vmap`.
+        contact: how contact is stepped, see `rollout`; by default with the derivative that descents need, the slope.
     """
 
     scene: Scene
@@ -104,9 +96,9 @@ class InScene(eqx.Module):
         check_contact(contact)
         return dataclasses.replace(self, contact=contact)
 
-    def with_softness(self: Same, softness: Softness) -> Same:
-        """Return a copy with other contact softness."""
-        return dataclasses.replace(self, scene=self.scene.with_softness(softness))
+    def with_softness(self: Same, softness: Softness | None) -> Same:
+        """Return a copy with other contact softness; None leaves it unchanged."""
+        return self if softness is None else dataclasses.replace(self, scene=self.scene.with_softness(softness))
 
 
 class SceneTask(Task, InScene):
@@ -125,8 +117,8 @@ class SceneTask(Task, InScene):
     state: State
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True)
-    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=optional_pytree, default=None)
-    observe: Observe | None = eqx.field(converter=optional_pytree, default=None, kw_only=True)
+    start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=as_pytree, default=None)
+    observe: Observe | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
     @property

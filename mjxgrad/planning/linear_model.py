@@ -126,7 +126,7 @@ class Sampled(Smoother):
         stddev_state: standard deviation of the noise on the state, a number or one per coordinate of a change.
         stddev_control: standard deviation of the noise on the control, a number or one per control.
         num_samples: number of samples. A smoothed step takes `1 + 2 num_samples` steps, a linear model `1 + num_samples`.
-        order: "first" averages Jacobians, "zeroth" fits a plane.
+        order: "first" averages Jacobians; "zeroth" fits a plane, to two samples more than coordinates at least.
     """
 
     stddev_state: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
@@ -139,10 +139,7 @@ class Sampled(Smoother):
             raise ValueError(f"order must be 'first' or 'zeroth', got {self.order!r}")
 
     def step(self, system, state, control, key):
-        """Return the mean of the finite next states under noise; for one key it is a fixed function of state and control.
-
-        Each sample is taken with its mirror image, so a linear step is averaged without error.
-        """
+        """Return the mean of the finite next states; samples have mirror images, so a linear step has no error."""
         stddev = self._stddev(system, state.dtype, least=1)
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
         nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
@@ -156,10 +153,9 @@ class Sampled(Smoother):
     def _first_order(
         self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
     ) -> LinearModel:
-        """Return the linear model from averaged Jacobians.
+        """Return the linear model from averaged Jacobians; exact for a linear step.
 
-        From each sample's next state the part that the other samples' mean Jacobian explains is subtracted. The noise then
-        adds nothing to a linear step: A, B and c are exact.
+        From each sample's next state the part that the other samples' mean Jacobian explains is subtracted.
         """
         stddev = self._stddev(system, state.dtype, least=2)
         noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
@@ -179,8 +175,7 @@ class Sampled(Smoother):
     ) -> LinearModel:
         """Return the linear model from a plane fitted to samples of the step by least squares.
 
-        Under Gaussian noise the slope of the plane converges to the derivative of the mean (Stein's identity), jumps included.
-        The fit needs at least two samples more than coordinates of state and control. A column without noise is zero.
+        Its slope converges to the derivative of the mean (Stein's identity). A column without noise is zero.
         """
         least = system.num_changes + system.num_controls + 2
         stddev = self._stddev(system, state.dtype, least)
@@ -235,7 +230,6 @@ def _resting(system: SceneSystem, start: np.ndarray) -> list[ContactPair]:
 
 
 def _perturbed(system: System, state: StateVector, control: ControlVector, noise: Float[Array, " both"]) -> StateVector:
-    """Return the next state under noise on state and control."""
     n = system.num_changes
     return system.step(system.retract(state, noise[:n]), control + noise[n:])
 
@@ -270,7 +264,6 @@ def _linearised(
 
 
 def _mean(samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]) -> Float[Array, "..."]:
-    """Return the mean of the used samples."""
     used = is_used.reshape(-1, *[1] * (samples.ndim - 1))
     return jnp.where(used, samples, 0.0).sum(axis=0) / jnp.maximum(is_used.sum(), 1)
 
@@ -282,7 +275,7 @@ def _model(
     change: ChangeVector,
     exists: Bool[Array, ""],
 ) -> LinearModel:
-    """Return the linear model from a Jacobian by state and control; all NaN if too few samples were finite."""
+    """Return the linear model from a Jacobian by state and control; all NaN if it does not exist."""
     jacobian, change = (jnp.where(exists, x, jnp.nan) for x in (jacobian, change))
     A, B = jnp.split(jacobian, [system.num_changes], axis=1)
     return LinearModel(A, B, system.retract(nominal, change))

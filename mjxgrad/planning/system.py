@@ -1,7 +1,6 @@
 """Systems and costs for planning: a map from a state and a control to the next state, and the cost of a plan.
 
-A state is one flat vector. A change of it has the coordinates of the tangent space, fewer than the state's for quaternions.
-Code that linearises, samples or plans moves states by `retract` and compares them by `difference`, for any coordinates.
+A state is one flat vector. A change of it has the coordinates of the tangent space: `retract` and `difference` convert.
 """
 
 import dataclasses
@@ -14,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
+from mjxgrad.rollouts.state import data_of, state_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete, check_contact, step
 
@@ -82,11 +81,7 @@ class System(eqx.Module):
 
 
 class FunctionSystem(System):
-    """A function of two vectors as a system.
-
-    Attributes:
-        function: function from state and control to the next state.
-    """
+    """A function from state and control to the next state as a system."""
 
     function: Callable[[ChangeVector, ControlVector], ChangeVector] = eqx.field(converter=as_pytree)
     num_changes: int = eqx.field(static=True)
@@ -142,22 +137,14 @@ class SceneSystem(System):
     @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv
-        data = self.scene.data.replace(
-            qpos=state[:nq],
-            qvel=state[nq : nq + nv],
-            act=state[nq + nv :],
-            qacc_warmstart=jnp.zeros_like(state[nq : nq + nv]),
-            ctrl=control,
-        )
+        qvel = state[nq : nq + nv]
+        start = State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
 
-        def advance(data: mjx.Data, _: None) -> tuple[mjx.Data, None]:
-            # Only these fields are carried: the rest of Data would be copied in every iteration.
-            moved = step(self.scene.model, data, contact=self.contact)
-            names = ("qpos", "qvel", "act", "qacc_warmstart")
-            return data.replace(**{name: getattr(moved, name) for name in names}), None
+        def advance(now: State, _: None) -> tuple[State, None]:
+            data = data_of(self.scene, now, control)
+            return state_of(step(self.scene.model, data, contact=self.contact)), None
 
-        data, _ = jax.lax.scan(advance, data, None, length=self.num_substeps)
-        return jnp.concatenate([data.qpos, data.qvel, data.act])
+        return self.flatten(jax.lax.scan(advance, start, None, length=self.num_substeps)[0])
 
     def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv

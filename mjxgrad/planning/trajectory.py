@@ -158,10 +158,9 @@ def optimise_trajectory(
 ) -> Plan:
     """Improve controls by iterating on linear-quadratic models of the smoothed system (iLQR), with decreasing smoothing.
 
-    Each iteration linearises the system along its course under the present smoothing. It solves the linear-quadratic problem
-    within the control limits and takes the best of several step lengths, by the cost of the smoothed system under the next,
-    smaller smoothing. The cost of the system itself under the same controls is recorded, and the controls with the lowest such
-    cost are returned.
+    Each iteration linearises the system along its course and solves the linear-quadratic problem within the control limits.
+    It takes the best of several step lengths, by the cost under the next, smaller smoothing. The controls with the lowest
+    cost of the system itself are returned.
 
     Args:
         system: the system to be controlled.
@@ -192,7 +191,16 @@ def optimise_trajectory(
     lower, upper = system.limits(lower, upper, start.dtype)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
-    _check(system, controls, factors, lower, upper)
+    if controls.shape[1] != system.num_controls or not len(controls):
+        wanted = f"(horizon, {system.num_controls}) with a horizon of at least 1"
+        raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
+    if factors.ndim != 1 or not factors.size:
+        raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
+    given, low, high = known(factors), known(lower), known(upper)
+    if given is not None and not (given > 0).all():
+        raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
+    if low is not None and high is not None and not (low <= high).all():
+        raise ValueError(f"lower must be at most upper, got {low} and {high}")
     problem = _Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper)
     return _improved(problem, start, controls, factors)
 
@@ -202,9 +210,6 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
     """Return the plan; its data are arguments, so that a receding horizon needs no new compilation."""
     system, smoother, horizon = problem.system, problem.smoother, len(controls)
     steps = jnp.array((0.0, *_STEPS), start.dtype)
-    zero, m = jnp.zeros((), start.dtype), system.num_controls
-    no_gain = jnp.zeros((horizon, m, system.num_changes), start.dtype)
-    rest = Feedback(jnp.zeros((horizon, m), start.dtype), no_gain, zero, jnp.asarray(True))
     at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
     given = _Course(at_start, jnp.clip(controls, problem.lower, problem.upper), jnp.asarray(jnp.inf, start.dtype))
 
@@ -215,7 +220,7 @@ def _improved(problem: _Problem, start: StateVector, controls: _Controls, factor
         tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
         index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
         course = jax.tree.map(lambda x: x[index], tried)
-        true = problem.run(None, course, rest, 0.0)
+        true = problem.run(None, course, law, 0.0)
         best = jax.tree.map(lambda new, old: jnp.where(is_first | (true.cost < best.cost), new, old), true, best)
         # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
         change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
@@ -266,27 +271,6 @@ def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: 
 
     moved, _ = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models.A, models.B))
     return (gain > _TOLERANCE * jnp.abs(cost)) & (moved <= _ROUNDINGS * jnp.finfo(moved.dtype).eps * jnp.max(moved))
-
-
-def _check(
-    system: System,
-    controls: Float[Array, "_ _"],
-    factors: Float[Array, "..."],
-    lower: ControlVector,
-    upper: ControlVector,
-) -> None:
-    if controls.shape[1] != system.num_controls or not len(controls):
-        raise ValueError(
-            f"controls must have shape (horizon, {system.num_controls}) with a horizon of at least 1, got {controls.shape}"
-        )
-    if factors.ndim != 1 or not factors.size:
-        raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
-    given = known(factors)
-    if given is not None and not (given > 0).all():
-        raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
-    low, high = known(lower), known(upper)
-    if low is not None and high is not None and not (low <= high).all():
-        raise ValueError(f"lower must be at most upper, got {low} and {high}")
 
 
 def backward_pass(

@@ -38,8 +38,7 @@ class ActionTask(SceneTask):
             stddev: standard deviation in units of the controls; None takes the task's.
             softness: softness of contact; None leaves it unchanged.
         """
-        task = self if softness is None else self.with_softness(softness)
-        stddev = self.stddev if stddev is None else stddev
+        task, stddev = self.with_softness(softness), self.stddev if stddev is None else stddev
         if self.policy is None:
             return open_loop(task, stddev)
         return closed_loop(task, self.policy, stddev, params=self.start_params)

@@ -1,7 +1,4 @@
-r"""A ball thrown at an angle over a wall: cleared or blocked.
-
-First-order and zeroth-order gradients differ in this example, with real contact in place of a formula. The cost is the
-squared distance between the ball's end and a target behind the wall, a function of the angle alone.
+r"""A ball thrown at an angle over a wall: cleared or blocked. First-order and zeroth-order gradients differ here.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
@@ -50,8 +47,7 @@ class BallWall(InScene):
 
         Softness applies to all contacts, and None leaves it unchanged; for the wall alone see `wall_softness`.
         """
-        task = self if softness is None else self.with_softness(softness)
-        return parameter_noise(task.cost, stddev, dim=1)
+        return parameter_noise(self.with_softness(softness).cost, stddev, dim=1)
 
 
 def ball_wall() -> BallWall:

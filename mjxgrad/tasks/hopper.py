@@ -1,11 +1,10 @@
 """Gymnasium's hopper, dropped onto its foot under a linear policy that holds a posture.
 
-Nothing in it jumps, and yet its policy gradient is the hardest case of the discrete derivative. The impedance is not zero at
-first touch, so the derivative is wrong for every parameter that shifts the time of landing.
+Nothing in it jumps, yet the discrete derivative is wrong for every parameter that shifts the time of landing: the impedance
+is not zero at first touch.
 """
 
-import dataclasses
-
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -35,7 +34,8 @@ def hopper(*, horizon: int = 150) -> ActionTask:
     policy, zero = linear_policy(6, 3, observe=joints)
     stiffness, damping = jnp.array(STIFFNESS), jnp.array(DAMPING)
     gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
-    posture = dataclasses.replace(zero, gain=gain, offset=stiffness * jnp.array(START_POSE[3:]))
+    offset = stiffness * jnp.array(START_POSE[3:])
+    posture = eqx.tree_at(lambda layer: (layer.weight, layer.bias), zero, (gain, offset))
     # The number of controls is the scene's; pyright expects an argument, since `Task` declares a variable.
     return ActionTask(  # pyright: ignore[reportCallIssue]
         scene=scene,

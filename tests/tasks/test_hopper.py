@@ -57,11 +57,11 @@ def test_after_the_landing_only_the_slope_derivative_is_the_slope():
     -∫ w' c / ∫ w, whatever the shape of c.
     """
     task = hopper()
-    offset = jnp.asarray(task.start_params.offset)
+    offset = jnp.asarray(task.start_params.bias)
     shifts = jnp.asarray(mg.diagnostics.phases((-0.1, 0.1), 480))
 
     def cost(shift, gradient):
-        params = eqx.tree_at(lambda p: p.offset, task.start_params, offset.at[2].add(shift))
+        params = eqx.tree_at(lambda p: p.bias, task.start_params, offset.at[2].add(shift))
         return task.with_contact(own_motion(gradient)).run(task.policy, params).cost
 
     def along(gradient):
