@@ -236,24 +236,6 @@ def test_a_cost_that_is_not_finite_leaves_no_reference_within_reach():
     assert abs(far - 1) < 0.01
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"params": jnp.array([0.1])}, r"params must have shape \(points, dim\), got \(1,\)"),
-        ({"num_samples": 1}, "num_samples must be at least 2, got 1"),
-        ({"num_reference": 3}, "num_reference must be at least 4, got 3"),
-        ({"softness": {"a": jnp.ones(2), "b": jnp.ones(3)}}, "softness must have the same leading axis in every leaf"),
-        ({"confidence": 95.0}, "confidence must be between 0 and 1, got 95.0"),
-    ],
-)
-def test_bad_arguments_are_answered_with_what_is_right(arguments, sentence):
-    good = {"params": POINTS, "softness": WIDTHS, "num_samples": 8}
-    with pytest.raises(ValueError, match=sentence):
-        bias_variance(
-            lambda width: parameter_noise(textbook.ramp(width), STDDEV), key=jax.random.key(0), **(good | arguments)
-        )
-
-
 def test_intervals_of_means_cover_as_often_as_they_say():
     samples = np.random.default_rng(0).normal(3.0, 2.0, (4000, 6))
     error = samples.std(axis=1, ddof=1) / np.sqrt(6)

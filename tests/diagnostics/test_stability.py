@@ -143,9 +143,3 @@ def test_the_summary_names_the_scene_its_springs_and_its_warnings():
     assert "contact floor – ball" in text
     assert all(one[:40] in text for one in report.warnings)
     assert max(map(len, text.splitlines())) < 160
-
-
-@pytest.mark.parametrize("speed", [0.0, -1.0, np.nan])
-def test_a_speed_that_is_none_is_refused(speed):
-    with pytest.raises(ValueError, match="speed must be positive"):
-        _report(speed=speed)

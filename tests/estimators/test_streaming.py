@@ -1,11 +1,13 @@
 """Samples in chunks: memory, rounding, and honest counts of what was spent."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
+from mjxgrad import estimators
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import first_and_zeroth_order, first_order, zeroth_order
@@ -14,16 +16,11 @@ POINT = jnp.array([0.5, -1.2, 0.4])
 
 
 @pytest.fixture
-def key():
-    return jax.random.key(3)
-
-
-@pytest.fixture
 def objective():
     return parameter_noise(textbook.bumpy, jnp.array([0.1, 0.4, 0.2]))
 
 
-@pytest.mark.parametrize("chunk_size", [2, 7, 64, 1000])
+@pytest.mark.parametrize("chunk_size", [2, 64])
 @pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
 def test_the_size_of_chunks_changes_nothing_but_rounding(objective, key, chunk_size, baseline):
     settings = {"num_samples": 130, "baseline": baseline, "antithetic": True}
@@ -62,6 +59,7 @@ def test_sharing_rollouts_gives_what_each_estimator_gives_alone(objective, key):
         (first_order, {}, 40, 40),
         (zeroth_order, {"baseline": "zero_noise"}, 41, 0),
         (zeroth_order, {"antithetic": True}, 40, 0),
+        (eqx.filter_jit(estimators.alpha_order), {}, 40, 40),
         (lambda *a, **k: first_and_zeroth_order(*a, **k)[0], {"baseline": "zero_noise"}, 41, 41),
     ],
 )

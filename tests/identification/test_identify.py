@@ -180,56 +180,6 @@ def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
         mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})])
 
 
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (
-            lambda cart: Recording({"place": np.zeros(3)}, times=[0, 1]),
-            "measured and times of the recording must have the same number",
-        ),
-        (lambda cart: Recording({"place": np.zeros(2)}, times=[1, 0]), "times of the recording must increase"),
-        (
-            lambda cart: Recording({"place": np.zeros(2)}, noise={"palce": 1}),
-            "noise of the recording must name measured signals",
-        ),
-        (lambda cart: Recording({"place": np.zeros(9)}).cut(0.1, 0.01), "must have measured qpos and qvel to be cut"),
-        (
-            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((3, 1)), _STEP * np.arange(5))]),
-            "controls of the recording must have a row for each of 4",
-        ),
-        (
-            lambda cart: stack(cart, [Recording({"place": np.zeros(5)}, np.zeros((4, 2)))]),
-            "must have 1 columns in this scene",
-        ),
-        (
-            lambda cart: stack(cart, [Recording({"qvel": np.zeros((5, 2))})]),
-            "qvel of the recording must have 1 columns",
-        ),
-        (
-            lambda cart: stack(cart, [Recording({"speed": np.zeros(5)})]),
-            "there is no sensor 'speed'; named sensors are 'place'",
-        ),
-        (lambda cart: Recording({"place": np.zeros(3)}, np.zeros((3, 1))), "4 rows for 3 controls, one at each state"),
-        (
-            lambda cart: Recording({"place": np.zeros(3)}, noise={"place": 0.0}),
-            "noise of place of the recording must be positive",
-        ),
-        (lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, []), "recordings must hold at least one"),
-        (
-            lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.full(5, np.nan)})]),
-            "got NaN alone",
-        ),
-        (
-            lambda cart: mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})], delay="b"),
-            "delay must name one",
-        ),
-    ],
-)
-def test_refusals_name_the_remedy(cart, build, message):
-    with pytest.raises(ValueError, match=message):
-        build(cart)
-
-
 def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
     """0.1 m/s that the recording does not tell: the gear takes them up, and what is left is a curve and no noise.
 

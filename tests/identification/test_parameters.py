@@ -123,26 +123,3 @@ def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
         np.testing.assert_allclose(
             getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name
         )
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda scene: Parameter(3.0, 0.0, 1.0), "lower, nominal and upper must increase"),
-        (lambda scene: Parameter([1.0, 2.0], [0.0, 0.0, 0.0]), "lower must be one number or of shape"),
-        (lambda scene: Parameter(np.nan), "nominal must be finite"),
-        (lambda scene: identification.armature(scene, "slide"), "bounds of armature must be given"),
-        (
-            lambda scene: identification.mass(scene, "leg"),
-            "there is no body 'leg'; named bodies are 'world', 'arm', 'ball'",
-        ),
-        (
-            lambda scene: identification.softness(scene, "hardness"),
-            "part must be one of stiffness, damping_ratio, width",
-        ),
-        (lambda scene: Coordinates.of({}), "parameters must name at least one"),
-    ],
-)
-def test_refusals_name_the_remedy(scene, build, message):
-    with pytest.raises(ValueError, match=message):
-        build(scene)

@@ -219,20 +219,6 @@ def test_the_rate_falls_to_zero_or_by_a_share(decay, rates):
         assert_allclose(change, [-rate], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"window": 0}, "window must be at least 1, got 0"),
-        ({"discount": 1.5}, "discount must be from 0 to 1, got 1.5"),
-        ({"stddev": (0.1, 0.0)}, "stddev must be positive"),
-        ({"critic_batches": 5}, "critic_batches must divide the 2048 states of an update, got 5"),
-    ],
-)
-def test_settings_out_of_range_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        learning.Settings(**change)
-
-
 _PROGRAM = """
     import sys
 

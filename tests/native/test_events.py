@@ -276,7 +276,9 @@ def test_rounding_decides_no_derivative():
         return mg.rollout(scene, start, horizon=50, contact=mg.Slope("mujoco")).final.qpos
 
     _, derivatives = jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,)))(jnp.linspace(0, 0.1, 8))
-    np.testing.assert_allclose(derivatives, np.tile([1.0, 0.0], (8, 1)), atol=1e-4)  # differences of 1e-6 of a few mm a step
+    np.testing.assert_allclose(
+        derivatives, np.tile([1.0, 0.0], (8, 1)), atol=1e-4
+    )  # differences of 1e-6 of a few mm a step
 
 
 def _num_contacts(scene, x):

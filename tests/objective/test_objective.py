@@ -102,11 +102,6 @@ def test_single_precision_stays_single():
     assert objective.score(params, noise).dtype == jnp.float32
 
 
-def test_noise_of_an_unknown_dimension_is_refused_by_name():
-    with pytest.raises(ValueError, match="dim is not known: pass dim"):
-        parameter_noise(textbook.bumpy, STDDEV).sample_noise(jax.random.key(0))
-
-
 class Laplace(Objective):
     """Noise that is not Gaussian, known by its density alone: exp(-|w|)/2 on each parameter."""
 

@@ -61,13 +61,3 @@ def test_a_linear_policy_costs_what_the_recursion_says():
     objective = mg.closed_loop(task, policy, 0.3, params=params)
     expected = task.expected_cost({"gain": params.gain, "offset": params.offset}, 0.0)
     np.testing.assert_allclose(objective.value(objective.ravel(params), objective.zero_noise()), expected, rtol=1e-12)
-
-
-def test_sizes_and_states_that_do_not_fit_are_refused():
-    policy, params = mg.linear_policy(3, 1)
-    with pytest.raises(ValueError, match=r"must observe 3 numbers, got shape \(2,\); set num_states, or observe"):
-        policy(params, STATE)
-    with pytest.raises(ValueError, match="state must be a vector or a State, got dict; pass observe="):
-        policy(params, {"x": STATE})
-    with pytest.raises(ValueError, match="num_controls must be at least 1, got 0"):
-        mg.linear_policy(3, 0)

@@ -442,18 +442,6 @@ def test_the_width_can_be_swept_and_differentiated():
     np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / 2e-4, rtol=1e-3)
 
 
-@pytest.mark.parametrize("width", [-0.1, np.nan, np.inf])
-def test_a_width_without_meaning_is_refused(width):
-    with pytest.raises(ValueError, match="width must be finite and not negative"):
-        mg.Onset(width)
-
-
-def test_a_batch_of_widths_is_refused():
-    scene = _scene(_BALL.format(cone="pyramidal", condim=3))
-    with pytest.raises(ValueError, match=r"width must be one value .* sweep under jax\.vmap"):
-        mg.step(scene.model, scene.data, contact=mg.Onset(jnp.ones(3)))
-
-
 _BALL_ON_BOX = """
 <mujoco>
   <default><geom margin="5"/></default>

@@ -91,8 +91,3 @@ def test_the_first_that_finds_no_room_is_no_nearer_than_any_that_does():
     placed = scene.data.replace(geom_xpos=data.geom_xpos, geom_xmat=data.geom_xmat)
     np.testing.assert_allclose(missed(placed), expected, rtol=1e-12)
     assert first_missed(every.model, data) == np.inf
-
-
-def test_room_for_none_is_refused():
-    with pytest.raises(ValueError, match="max_contacts must be at least 1, got 0; None has room for all"):
-        mg.load_scene(SCENE.format(cone="elliptic"), max_contacts=0)
