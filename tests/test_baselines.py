@@ -87,18 +87,3 @@ def test_candidates_have_starts_of_their_own_and_no_noise_on_actions(key):
     actions, starts = jax.vmap(lambda k: without_action_noise(cost, k))(jax.random.split(key, 50))
     np.testing.assert_array_equal(actions, 0)
     assert len(np.unique(starts[:, 0])) == 50
-
-
-def test_a_method_is_resumed(tmp_path, key):
-    method = functools.partial(search, objective, START, key, num_steps=20)
-
-    def kill(step, _):
-        if step >= 10:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        method(checkpoint=tmp_path / "run.npz", log=kill)
-    resumed = method(checkpoint=tmp_path / "run.npz")
-    straight = method()
-    np.testing.assert_array_equal(resumed.params, straight.params)
-    np.testing.assert_array_equal(resumed.history.cost, straight.history.cost)

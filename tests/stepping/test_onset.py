@@ -11,8 +11,6 @@ import pytest
 
 import mjxgrad as mg
 from experiments.sawtooth import case
-from mjxgrad._mjx import mjx
-from mjxgrad.contact.collision import collide
 from mjxgrad.stepping.onset import _split
 from mjxgrad.stepping.rows import Block
 from mjxgrad.tasks import wall_softness
@@ -440,53 +438,6 @@ def test_the_width_can_be_swept_and_differentiated():
     # Longer steps than rounding asks for: a solve of tolerance 1e-13 is known to some 1e-13 m/s.
     ends = jax.jit(jax.vmap(after))(jnp.concatenate([widths + 1e-4, widths - 1e-4])).reshape(2, 3)
     np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / 2e-4, rtol=1e-3)
-
-
-_BALL_ON_BOX = """
-<mujoco>
-  <default><geom margin="5"/></default>
-  <worldbody>
-    <body><freejoint/><geom type="sphere" size=".03"/></body>
-    <body><freejoint/><geom type="box" size=".1 .2 .05"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-
-def test_the_distance_of_a_ball_from_a_box_is_cs_inside_and_outside():
-    model = mujoco.MjModel.from_xml_string(_BALL_ON_BOX)
-    random = np.random.default_rng(3)
-    mjx_model = mjx.put_model(model)
-    template = mjx.make_data(mjx_model)
-
-    @jax.jit
-    def find(qpos):
-        data = template.replace(qpos=qpos)
-        contact = collide(mjx_model, mjx.kinematics(mjx_model, data))._impl.contact
-        return contact.dist[0], contact.frame[0, 0], contact.pos[0]
-
-    data, num_inside = mujoco.MjData(model), 0
-    for _ in range(200):
-        quaternion = random.normal(size=4)
-        data.qpos[:] = [
-            *random.uniform(-0.25, 0.25, 3),
-            1,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            *(quaternion / np.linalg.norm(quaternion)),
-        ]
-        mujoco.mj_forward(model, data)
-        dist, normal, pos = find(jnp.asarray(data.qpos))
-        theirs = data.contact[0]
-        num_inside += theirs.dist < -0.03
-        np.testing.assert_allclose(dist, theirs.dist, atol=1e-12)
-        np.testing.assert_allclose(normal, theirs.frame[:3], atol=1e-9)
-        np.testing.assert_allclose(pos, theirs.pos, atol=1e-9)
-    assert num_inside > 10
 
 
 def test_a_weight_that_rounds_to_one_keeps_its_derivative():
