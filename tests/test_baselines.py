@@ -77,13 +77,8 @@ def test_nothing_finite_is_no_step(key):
     np.testing.assert_array_equal(result.params, START)
 
 
-class RandomStart(textbook.LinearSystem):
-    def sample_start(self, key):
-        return self.start + jax.random.normal(key, (2,))
-
-
 def test_candidates_have_starts_of_their_own_and_no_noise_on_actions(key):
-    cost = mg.open_loop(RandomStart(), 0.1)
+    cost = mg.open_loop(textbook.RandomStart(), 0.1)
     actions, starts = jax.vmap(lambda k: without_action_noise(cost, k))(jax.random.split(key, 50))
     np.testing.assert_array_equal(actions, 0)
     assert len(np.unique(starts[:, 0])) == 50

@@ -73,7 +73,23 @@ def test_any_part_can_be_imported_first():
 
 def test_packages_that_are_named_are_imported():
     """Lint cannot see it: names of shapes in annotations look like undefined ones."""
-    known = set("mg jax jnp np eqx mujoco mjx optax plt pd xr mjxgrad math os sys".split())
+    known = {
+        "mg",
+        "jax",
+        "jnp",
+        "np",
+        "eqx",
+        "mujoco",
+        "mjx",
+        "optax",
+        "plt",
+        "pd",
+        "xr",
+        "mjxgrad",
+        "math",
+        "os",
+        "sys",
+    }
     missing = []
     for path in [path for part in ("mjxgrad", "experiments", "tests") for path in (ROOT.parent / part).rglob("*.py")]:
         nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))

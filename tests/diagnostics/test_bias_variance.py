@@ -139,21 +139,6 @@ def test_the_table_says_what_is_biased_and_how_large(jumps):
     assert any(cell.strip().endswith("*") for cell in cells)
 
 
-def test_the_picture_has_every_estimate_and_axes_with_units(jumps):
-    pyplot = pytest.importorskip("matplotlib.pyplot")
-    pyplot.switch_backend("Agg")
-    figure = jumps[0].plot()
-    (upper, *_), (lower, *_) = np.array(figure.axes).reshape(2, 3)
-    assert [text.get_text() for text in upper.get_legend().get_texts()][-3:] == [
-        "first order",
-        "zeroth order",
-        "α-order",
-    ]
-    assert lower.get_xlabel() == "number"
-    assert lower.get_ylabel() == "variance of one rollout"
-    pyplot.close(figure)
-
-
 def test_the_landscape_is_the_cost(jumps):
     table, _, _ = jumps
     x = table.landscape.points

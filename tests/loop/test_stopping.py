@@ -57,16 +57,6 @@ def test_a_run_that_feels_nothing_stops_at_once_and_says_so(key):
     np.testing.assert_array_equal(result.params, START)
 
 
-def test_one_seed_that_feels_nothing_stops_without_the_others(key):
-    starts = jnp.array([[0.0, 0.5], [2.0, 2.0]])
-    result = mg.optimise(
-        mg.parameter_noise(dead_zone, 0.1), starts, jax.random.split(key, 2),
-        estimator=problems.first_order, optimiser=optax.sgd(0.01), num_steps=10,
-    )  # fmt: skip
-    assert list(result.stopped == mg.Stopped.nothing_felt) == [True, False]
-    assert list(result.num_steps) == [3, 10]
-
-
 def test_momentum_has_the_patience_of_the_run_to_leave_a_zone_where_nothing_is_felt(key):
     """Nothing is felt from 1 to 1.3, where momentum crosses: 0.5, then 0.45, 0.405 ... a step of 0.1."""
 

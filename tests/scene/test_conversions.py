@@ -75,8 +75,7 @@ EXACT = {
         _pendulum(rest=TENDON + "<actuator><motor name='a' tendon='t' gear='2' armature='0.5' "
                   "damping='0.3'/></actuator>"), "actuator 'a' armature, damping"),
     "frictionless pyramid": (_ball(friction="0 0 0"), "friction of floor – g"),
-    "frictionless cone": (
-        _ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
+    "frictionless cone": (_ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
     "rolls freely": (_ball(friction="1 0 0", condim=6), "friction of floor – g"),
     "frictionless pair": (
         _ball(rest="<contact><pair geom1='g' geom2='floor' friction='0 0 0 0 0'/></contact>"),
