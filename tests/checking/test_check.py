@@ -106,13 +106,6 @@ def test_pairs_are_counted_as_they_are_listed():
     assert count_pairs(model) == len(contact_pairs(model)) == 10
 
 
-def test_all_sources_give_the_same_verdict():
-    text = ball()
-    spec, model = mujoco.MjSpec.from_string(text), mujoco.MjModel.from_xml_string(text)
-    sources = (text, spec, model, mg.load_scene(text))
-    assert len({quick(source).headline for source in sources}) == 1
-
-
 def test_what_a_budget_leaves_no_time_for_is_named():
     """Nothing is begun after a thousandth of a second."""
     verdict = mg.check(ball(), budget=1e-3)

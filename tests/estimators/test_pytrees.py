@@ -26,10 +26,7 @@ class Push(eqx.Module):
     profile: object
 
 
-FORMS = {
-    "dict": {"force": VECTOR[:2], "place": VECTOR[2]},
-    "module": Push(VECTOR[:2], VECTOR[2], jnp.tanh),
-}
+FORMS = {"dict": {"force": VECTOR[:2], "place": VECTOR[2]}, "module": Push(VECTOR[:2], VECTOR[2], jnp.tanh)}
 
 
 def leaves(tree):

@@ -19,10 +19,7 @@ def throws(task, biased, zeroth=0.0, noisy=0):
     stiffness, zero = [10.0, 100.0, 1e4], np.zeros((3, 2))
     off = zero.copy()
     off[0, 0] = zeroth
-    cells = {
-        "is_biased": np.array(biased)[:, None] & np.ones((3, 2), bool),
-        "zeroth_is_off": abs(off) > 2,
-    }
+    cells = {"is_biased": np.array(biased)[:, None] & np.ones((3, 2), bool), "zeroth_is_off": abs(off) > 2}
     cells |= {"reference": zero + 1, "bias_low": zero - 0.1, "bias_high": zero + 0.1 + np.array([[0], [noisy], [0]])}
     swept = xr.Dataset(
         {name: (("stiffness", "angle"), value) for name, value in cells.items()}, {"stiffness": stiffness}

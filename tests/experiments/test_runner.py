@@ -167,7 +167,7 @@ def test_an_unchanged_run_says_so_and_where_its_report_is(copied, capsys):
     assert (copied / "runs" / "steep" / "environment.json").read_text() == before
 
 
-def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch):
+def test_a_change_of_settings_or_source_or_force_or_a_damaged_record_runs_again(copied, monkeypatch):
     """A run that is reached raises here, and leaves the former result."""
     _raise(monkeypatch, ValueError("reached"))
     assert run(copied / "steep.toml", copied / "runs") == 0
@@ -176,6 +176,13 @@ def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch)
     (copied / "runs" / "steep" / "report.html").rename(copied / "gone.html")
     assert run(copied / "steep.toml", copied / "runs") == 2
     (copied / "gone.html").rename(copied / "runs" / "steep" / "report.html")
+    record = copied / "runs" / "steep" / "environment.json"
+    told = record.read_text()
+    for damaged in ("[]", "{", '{"fingerprint": 1}'):
+        record.write_text(damaged)
+        assert run(copied / "steep.toml", copied / "runs") == 2
+    record.write_text(told)
+    assert run(copied / "steep.toml", copied / "runs") == 0
     monkeypatch.setattr(runner, "ROOT", copied)
     assert run(copied / "steep.toml", copied / "runs") == 2
     assert (copied / "runs" / "steep" / "metrics.csv").is_file()
@@ -289,13 +296,6 @@ def test_a_choice_of_opengl_that_mujoco_does_not_know_is_a_sentence(tmp_path):
     result = subprocess.run(command, env=environment, cwd=runner.ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert result.stderr.endswith('MUJOCO_GL: bogus; unset it, or take "egl", "osmesa" or "glfw"\n')
-
-
-@pytest.mark.parametrize("damage", ["[]", "{", '{"fingerprint": 1}'])
-def test_a_damaged_record_of_a_run_is_none(copied, monkeypatch, damage):
-    (copied / "runs" / "steep" / "environment.json").write_text(damage)
-    _raise(monkeypatch, ValueError("reached"))
-    assert run(copied / "steep.toml", copied / "runs") == 2
 
 
 # A kind of two parts that kills itself in the second one, once.

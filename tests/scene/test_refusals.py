@@ -173,8 +173,7 @@ def test_contact_by_a_search_on_distance_fields_is_refused(kinds):
 
 
 @pytest.mark.parametrize(
-    "how",
-    [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}],
+    "how", [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}]
 )
 @pytest.mark.filterwarnings("error")
 def test_of_what_cannot_touch_no_search_is_refused(how):

@@ -26,9 +26,10 @@ def falling_file(tmp_path):
     return path
 
 
-def test_file_string_and_model_give_the_same_scene(falling_file):
+def test_file_string_model_and_spec_give_the_same_scene(falling_file):
     model = mujoco.MjModel.from_xml_string(FALLING)
-    scenes = [load_scene(source) for source in (falling_file, str(falling_file), FALLING, model)]
+    spec = mujoco.MjSpec.from_string(FALLING)
+    scenes = [load_scene(source) for source in (falling_file, str(falling_file), FALLING, model, spec)]
     for scene in scenes:
         assert scene.mj_model.nv == 1
         np.testing.assert_array_equal(scene.model.body_mass, model.body_mass)
