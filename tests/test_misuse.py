@@ -212,6 +212,10 @@ FOUND = {
     "mg.load_scene('.')": "got the folder",
     "mg.load_scene('<mujoco/>', timestep=0.0)": "timestep must be positive",
     "mg.load_scene('<mujoco><option timestep=\"nan\"/></mujoco>')": "must have a positive time step, got",
+    "mg.load_scene('<mujoco><worldbody><body><joint/><geom size=\".1\" friction=\"nan 0 0\"/></body></worldbody></mujoco>')":
+        "must hold numbers, got NaN in geom_friction",
+    "jax.vmap(balls.with_softness)(mg.Softness.sweep(stiffness=[1e2, 1e3], damping_ratio=1)).summary()":
+        "one scene with known values",
     "mg.load_scene('<mujoco><worldbody><geom size=\".1\"/></worldbody></mujoco>')": "got none (nv = 0)",
     "scene.with_model(dof_dampng=jnp.ones(1))": "numbers of the MJX model, got dof_dampng; did you mean dof_damping",
     "scene.with_model(geom_type=jnp.ones(1))": "must name arrays of numbers of the MJX model, got geom_type",
@@ -305,6 +309,7 @@ FOUND = {
     "envs.diffrl.CartPole(scene, frame_skip=0)": "frame_skip must be at least 1, got 0",
     "envs.diffrl.CartPole(scene, episode_length=0)": "episode_length must be at least 1, got 0",
     "cart.refined(0)": "times must be at least 1, got 0",
+    "mg.learning.learn([], key, num_updates=1)": "one or several, got an empty sequence",
     "mg.learning.Settings(window=0)": "window must be at least 1, got 0",
     "mg.learning.Settings(discount=1.5)": "discount must be from 0 to 1, got 1.5",
     "mg.learning.Settings(stddev=(0.1, 0.0))": "stddev must be positive",

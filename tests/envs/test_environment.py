@@ -92,11 +92,6 @@ def test_an_action_beyond_its_limits_is_the_limit(state, step):
     assert step(state, jnp.array([0.9])).metrics["push"] == pytest.approx(0.09)
 
 
-def test_the_reward_is_the_sum_of_its_terms(state, step):
-    stepped = step(state, ACTIONS[0])
-    np.testing.assert_allclose(stepped.reward, sum(stepped.metrics[k] for k in ("pole", "cart", "push")), rtol=1e-14)
-
-
 def test_time_that_is_up_truncates_and_does_not_terminate(state, step):
     ends = []
     for action in ACTIONS[:3]:

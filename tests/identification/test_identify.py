@@ -157,12 +157,8 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     qpos[20:, 3:7] *= -1  # the same turn
     turned = qpos.copy()
     w, x, y, z = qpos[25, 3:7]
-    turned[25, 3:7] = [
-        w - 0.01 * x,
-        x + 0.01 * w,
-        y + 0.01 * z,
-        z - 0.01 * y,
-    ]  # q ⊗ (1, 0.01, 0, 0): 0.02 rad about its own x
+    # q ⊗ (1, 0.01, 0, 0): 0.02 rad about its own x.
+    turned[25, 3:7] = [w - 0.01 * x, x + 0.01 * w, y + 0.01 * z, z - 0.01 * y]
     noise = {"qpos": [1, 1, 1, 0.5, 0.5, 0.5, 1]}
     whole = Recording({"qpos": turned, "qvel": course.qvel}, controls, noise=noise, start=start)
     windows = stack(scene, whole.cut(0.08, 0.01))

@@ -277,14 +277,6 @@ def test_seeds_and_environments_side_by_side_learn_as_each_alone(cartpole, key):
     assert not np.allclose(together.history["reward"][:, 0], together.history["reward"][:, 2], rtol=1e-3)
 
 
-def test_environments_that_differ_in_more_than_numbers_are_refused(cartpole, key):
-    other = dataclasses.replace(cartpole, frame_skip=3)
-    with pytest.raises(ValueError, match="must differ in numbers alone"):
-        learning.learn([cartpole, other], key, num_updates=1, settings=SMALL)
-    with pytest.raises(ValueError, match="one or several, got an empty sequence"):
-        learning.learn([], key, num_updates=1)
-
-
 def test_environments_share_all_numbers_but_those_that_differ(cartpole):
     """What all share is not copied for each of them."""
     both, axes = side_by_side([cartpole, _stronger(cartpole)])

@@ -87,12 +87,6 @@ def test_noise_has_the_standard_deviation_it_is_given():
     np.testing.assert_allclose(noise.std(axis=0), [0.1, 1.0, 20.0], rtol=4 / np.sqrt(2 * 4000))
 
 
-def test_zero_noise_changes_nothing():
-    objective = parameter_noise(textbook.bumpy, STDDEV, dim=3)
-    params = jnp.array([0.2, 0.5, -0.1])
-    assert objective.value(params, objective.zero_noise()) == textbook.bumpy(params)
-
-
 def test_single_precision_stays_single():
     """Noise of double precision does not turn a single-precision scene's parameters into double."""
     objective = parameter_noise(lambda x: x.sum(), STDDEV, dim=2)

@@ -177,12 +177,6 @@ def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
         np.testing.assert_allclose(model.c, model.A @ at + (model.B @ control), atol=1e-10)
 
 
-def test_a_step_can_be_jitted_as_it_is():
-    system = SceneSystem(mg.load_scene(SPRING))
-    at, control = jnp.array([0.1, -0.3]), jnp.array([0.7])
-    np.testing.assert_allclose(jax.jit(system.step)(at, control), system.step(at, control), rtol=1e-12)
-
-
 def test_limits_are_those_of_the_actuators_unless_others_are_given():
     ranged = SPRING.replace('<motor joint="x"/>', '<motor joint="x"/><motor joint="x" ctrlrange="-2 3"/>')
     system = SceneSystem(mg.load_scene(ranged))

@@ -98,13 +98,6 @@ def test_float32_asks_for_no_more_than_it_resolves():
     assert output[1] == "['tolerance'] True"
 
 
-def test_what_is_no_number_is_named():
-    with pytest.raises(SceneError, match="must hold numbers, got NaN in geom_friction"):
-        load_scene(
-            "<mujoco><worldbody><body><freejoint/><geom size='.1' friction='nan 0 0'/></body></worldbody></mujoco>"
-        )
-
-
 def test_what_mujoco_warns_of_is_a_warning_and_no_file(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     noted = FALLING.replace("<worldbody>", "<custom><numeric name='note' data='nan'/></custom><worldbody>")

@@ -1,6 +1,5 @@
 """The summary tells a human what there is."""
 
-import jax
 import pytest
 
 from mjxgrad.contact import Softness
@@ -68,10 +67,3 @@ def test_equal_pairs_share_a_line():
     text = load_scene(f"<mujoco><worldbody>{balls}</worldbody></mujoco>").summary()
     assert "36 pairs of geoms can touch" in text
     assert "+ 35 more" in text
-
-
-def test_a_batch_has_no_summary(scene):
-    sweep = Softness.sweep(stiffness=[1e2, 1e3], damping_ratio=1)
-    batch = jax.vmap(scene.with_softness)(sweep)
-    with pytest.raises(ValueError, match="one scene with known values"):
-        batch.summary()
