@@ -43,19 +43,21 @@ def noise_of_each_parameter():
     return parameter_noise(textbook.bumpy, jnp.asarray(stddev)), point, textbook.bumpy_gradient(point, stddev)
 
 
+@functools.cache
 def a_policy():
     """A linear system under a linear policy: mean and covariance, so the expected cost, by recursion."""
     task = textbook.LinearSystem()
     objective = closed_loop(task, textbook.linear_policy, 0.3, params=POLICY)
     at = objective.ravel(POLICY)
-    return objective, at, jax.grad(lambda p: task.expected_cost(objective.unravel(p), 0.3))(at)
+    return objective, at, jax.jit(jax.grad(lambda p: task.expected_cost(objective.unravel(p), 0.3)))(at)
 
 
+@functools.cache
 def controls():
     """The cost is quadratic in the controls, so noise adds a constant: the gradient is that without noise."""
     task, objective = textbook.LinearSystem(), open_loop(textbook.LinearSystem(), jnp.array([0.3]))
     np.testing.assert_array_equal(objective.unravel(objective.ravel(CONTROLS)), CONTROLS)
-    return objective, objective.ravel(CONTROLS), jax.grad(lambda u: task.run(u).cost)(CONTROLS).ravel()
+    return objective, objective.ravel(CONTROLS), jax.jit(jax.grad(lambda u: task.run(u).cost))(CONTROLS).ravel()
 
 
 @pytest.mark.parametrize("problem", [a_ramp, a_quadratic_with_a_sine, noise_of_each_parameter, a_policy, controls])

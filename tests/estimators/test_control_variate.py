@@ -80,7 +80,7 @@ def test_it_is_unbiased_in_closed_loop_from_random_starts_and_so_are_baselines_f
     objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
     flat = objective.ravel(params)
     estimates = repeat(estimator, objective, flat, 20_000, num_samples=8)
-    truth = jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2))(flat)
+    truth = jax.jit(jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2)))(flat)
     assert_unbiased_with_right_errors(estimates, np.asarray(truth), 8)
     assert np.all(np.asarray(estimates.num_rollouts) == num_rollouts)
 

@@ -101,7 +101,7 @@ def test_the_derivative_by_ten_numbers_is_that_of_the_tensor(body):
         offset = jnp.append(fields["body_ipos"], 1.0)
         return fields["body_mass"] * jnp.outer(offset, offset) + jnp.pad(about, (0, 1))
 
-    found, expected = (jax.jacfwd(f)(jnp.asarray(start)) for f in (there_and_back, pseudo_inertia))
+    found, expected = (jax.jit(jax.jacfwd(f))(jnp.asarray(start)) for f in (there_and_back, pseudo_inertia))
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 

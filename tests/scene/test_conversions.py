@@ -263,6 +263,6 @@ def test_a_muscle_has_a_derivative_in_single_precision():
     with jax.enable_x64(False):
         scene = load_scene(source)
         data = scene.data.replace(act=jnp.array([0.1]), ctrl=jnp.array([0.3]))
-        found = jax.grad(lambda act: forward(scene.model, data.replace(act=act)).act_dot[0])(data.act)
+        found = jax.jit(jax.grad(lambda act: forward(scene.model, data.replace(act=act)).act_dot[0]))(data.act)
     # The rate is (u - a) / (0.01 (0.5 + 1.5 a)), whose derivative by a is -(0.5 + 1.5 u) / (0.01 (0.5 + 1.5 a)^2).
     np.testing.assert_allclose(found, -0.95 / (0.01 * 0.65**2), rtol=1e-5)

@@ -130,7 +130,7 @@ def test_time_step_and_gravity_are_replaced_under_grad_and_vmap():
         return mg.rollout(moved, mg.initial_state(moved), horizon=10).qpos[-1, 2]
 
     steps, pulls = jnp.array([0.01, 0.02]), jnp.array([-9.81, 0.0])
-    values, slopes = jax.vmap(jax.value_and_grad(height, (0, 1)))(steps, pulls)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(height, (0, 1))))(steps, pulls)
     np.testing.assert_allclose(values, 55 * pulls * steps**2, atol=1e-15)
     np.testing.assert_allclose(slopes[0], 110 * pulls * steps, atol=1e-13)
     np.testing.assert_allclose(slopes[1], 55 * steps**2, rtol=1e-12)

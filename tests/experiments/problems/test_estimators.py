@@ -74,14 +74,14 @@ def test_reinforce_is_unbiased_for_a_policy(key, baseline):
     """Mean and covariance of a linear system under a linear policy follow by recursion, and so the expected cost."""
     cost = closed_loop()
     at = cost.ravel(POLICY)
-    exact = jax.grad(lambda p: cost.task.expected_cost(cost.unravel(p), 0.3))(at)
+    exact = jax.jit(jax.grad(lambda p: cost.task.expected_cost(cost.unravel(p), 0.3)))(at)
     assert_within_error(reinforce(cost, at, key, num_samples=100_000, baseline=baseline), exact)
 
 
 def test_reinforce_is_unbiased_for_controls(key):
     """The cost is quadratic in the controls, so noise adds a constant: the gradient is that without noise."""
     cost = mg.open_loop(textbook.LinearSystem(), 0.3)
-    exact = jax.grad(lambda u: cost.task.run(u[:, None]).cost)(CONTROLS)
+    exact = jax.jit(jax.grad(lambda u: cost.task.run(u[:, None]).cost))(CONTROLS)
     assert_within_error(reinforce(cost, CONTROLS, key, num_samples=100_000), exact)
 
 
