@@ -109,7 +109,7 @@ def teeth(smaller):
 
 SEES = {"first order": True, "zeroth order": False, "α-order": False}
 SEEDS, FEW = [9.0, 9, 9, 9], [1.0, 2, 3]
-ZEROTH, MANY = {"zeroth": [1.0, 2, 3, 4]}, [float(i) for i in range(8)]
+ZEROTH, MANY = [1.0, 2, 3, 4], [float(i) for i in range(8)]
 CASES = [
     ("bias_variance", throws("ball_wall", [0, 0, 1]), "right throughout; first order only up to stiffness 100 1/s²"),
     ("bias_variance", throws("ball_wall", [1, 1, 1], 5.0), "right at 5 of 6 points; first order at no contact"),
@@ -121,8 +121,8 @@ CASES = [
     ("work_precision", priced(5e-4, None, estimator="first order, onset"), "1 of 2 scenes; gradients: first order"),
     ("work_precision", priced(None), "No setting"),
     ("stability", stable([0, 1, 2], [0, 2, 2], [0, 2, 5]), "holds at 67% (C MuJoCo: 33%), gradients there at 50%"),
-    ("learning", taught(onset=SEEDS, late=("zeroth",), **ZEROTH), "Soonest and worth most: first order, 9.00."),
-    ("learning", taught(onset=SEEDS, late=("onset",), **ZEROTH), "Soonest: zeroth order; worth most: first order"),
+    ("learning", taught(onset=SEEDS, late=("zeroth",), zeroth=ZEROTH), "Soonest and worth most: first order, 9.00."),
+    ("learning", taught(onset=SEEDS, late=("onset",), zeroth=ZEROTH), "Soonest: zeroth order; worth most: first order"),
     ("learning", taught(alpha=[9.0] * 3, onset=FEW, late=("onset",)), "3 seeds cannot tell it from first order"),
     ("learning", taught(discrete=[9.0] * 3, slope=FEW, late=("discrete",)), "without an onset, 9.00 (unproven)"),
     ("learning", taught(environment="trot", onset=[-24.0]), "After 300 steps, 1.50 s, first order returns −24.0"),
