@@ -10,8 +10,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
+from mjxgrad.envs import ENVIRONMENTS
 from mjxgrad.envs.diffrl import CartPole
-from mjxgrad.envs.gym import GymEnv, GymVectorEnv
+from mjxgrad.envs.gym import GymEnv, GymVectorEnv, gym_name
 from mjxgrad.rollouts import initial_state, render
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
@@ -45,6 +46,13 @@ def episode(many):
     """What each step of an episode and the first of the next one told."""
     many.reset(seed=2)
     return [many.step(np.tile(ACTION, (3, 1))) for _ in range(LENGTH + 1)]
+
+
+def test_all_environments_are_registered_under_names_like_gymnasiums():
+    for name in ENVIRONMENTS:
+        assert gymnasium.spec(gym_name(name)).kwargs == {"environment": name}
+    assert gym_name("half_cheetah") == "mjxgrad/HalfCheetah-v0"
+    assert gym_name("diffrl_ant") == "mjxgrad/DiffRLAnt-v0"
 
 
 def test_make_imports_what_registers_them_and_make_vec_makes_one_program():

@@ -38,6 +38,12 @@ def _points(count=1, **values):
     )
 
 
+@pytest.mark.parametrize("size", ["quick", "default", "full"])
+def test_every_size_names_scenes_that_there_are(size):
+    sizes = load_runs("stability", [f"size={size}"])[0].settings.sizes
+    assert set(sizes.scenes or SCENES) <= set(SCENES)
+
+
 def test_the_grid_reaches_its_corners_and_coincident_centres():
     found = points(SCENES["two balls, pyramidal"], 12, 256, 0)
     low_high = {"mass_ratio": (1e-6, 1e6), "speed": (1e-2, 100.0), "timestep": (1e-4, 5e-2), "margin": (0.0, 0.02)}
