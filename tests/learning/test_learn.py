@@ -95,33 +95,30 @@ def test_an_interruption_in_the_middle_of_a_save_loses_nothing(cartpole, key, tm
     assert told == [2]
 
 
-class Cornered(CartPole):
-    """Its reward has an infinite slope where the action is zero, which the first window's first environment begins with."""
+class Spoiled(CartPole):
+    """Its reward has an infinite slope where the cart is to the right, or, where so much is lost, is no number at all."""
+
+    lost: jax.Array = eqx.field(kw_only=True)
 
     def rewards(self, before, action, after, memory):
         terms = super().rewards(before, action, after, memory)
-        return {**terms, "corner": jnp.sqrt(jnp.where(after.qpos[0] > 0, 0.0 * action[0], 1.0))}
+        corner = jnp.sqrt(jnp.where(after.qpos[0] > 0, 0.0 * action[0], 1.0))
+        return {**terms, "corner": corner + self.lost * after.qpos[0]}
 
 
 def test_derivatives_that_are_no_numbers_are_counted_and_replaced(cartpole, key):
     """Where the cart is to the right the derivative of √0 makes NaN of that window's, up to there."""
-    cornered = Cornered(cartpole.scene, frame_skip=2)
+    cornered = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.zeros(()))
     run = learning.learn(cornered, key, num_updates=1, log_every=1, settings=SMALL)
     assert 0 < run.history["not_finite"][0] < 1
     assert run.history["skipped"][0] == 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(run.policy.actor))
 
 
-class Lost(CartPole):
-    """A reward that is no number."""
-
-    def rewards(self, before, action, after, memory):
-        return {"lost": after.qpos[0] * jnp.nan}
-
-
 def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
-    start = ActorCritic(Lost(cartpole.scene), SMALL, 1).init(key)
-    run = learning.learn(Lost(cartpole.scene), key, num_updates=1, settings=SMALL)
+    lost = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.array(jnp.nan))
+    start = ActorCritic(lost, SMALL, 1).init(key)
+    run = learning.learn(lost, key, num_updates=1, log_every=1, settings=SMALL)
     assert run.history["skipped"][0] == 1
     # Up to rounding, since the start is compiled on its own there; one step of Adam would be 2e-3.
     jax.tree.map(lambda x, y: assert_allclose(x, y, atol=1e-12), run.policy.actor, start.policy.actor)
