@@ -75,7 +75,7 @@ def test_two_boxes_touch_where_they_do_in_c(margin):
 def test_a_square_turned_on_a_square_touches_at_an_octagon():
     """A square of side 2 turned by 45° within another: corners at (±1, ±(√2 - 1)) and the same exchanged."""
     half, turn = jnp.array([1.0, 1.0, 0.25]), np.sqrt(0.5) * np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]])
-    dist, pos, frame = box_box(
+    dist, pos, frame = jax.jit(box_box)(
         Box(jnp.zeros(3), jnp.eye(3), half), Box(jnp.array([0, 0, 0.49]), jnp.asarray(turn), half)
     )
     near = np.sqrt(2) - 1
@@ -97,7 +97,7 @@ def test_crossing_edges_touch_at_one_point():
     """Bars along x and y on edge: where the edges cross, half way between them."""
     half = jnp.array([1.0, 0.1, 0.1])
     x, axes = map(jnp.asarray, _crossing())
-    dist, pos, frame = box_box(*_boxes(x, axes, (half, half)))
+    dist, pos, frame = jax.jit(box_box)(*_boxes(x, axes, (half, half)))
     np.testing.assert_allclose(dist, [-0.01 * np.sqrt(2), *[ABSENT] * 7], atol=1e-14)
     np.testing.assert_allclose(pos[0], [0.02, 0, 0.095 * np.sqrt(2)], atol=1e-14)
     np.testing.assert_allclose(frame[0, 0], [0, 0, 1], atol=1e-14)
