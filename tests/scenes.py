@@ -61,10 +61,7 @@ _EQUALITY = """<connect body1="p" anchor="0 0 .1"/><weld body1="q" body2="p" tor
 def zoo(cone="pyramidal", integrator="Euler", welded=False):
     """Return the model of all kinds of rows and a state in which most of them are active."""
     text = ZOO.format(
-        cone=cone,
-        integrator=integrator,
-        welded=_WELDED if welded else "",
-        equality=_EQUALITY if welded else "",
+        cone=cone, integrator=integrator, welded=_WELDED if welded else "", equality=_EQUALITY if welded else ""
     )
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)

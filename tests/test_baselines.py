@@ -77,48 +77,8 @@ def test_nothing_finite_is_no_step(key):
     np.testing.assert_array_equal(result.params, START)
 
 
-class RandomStart(textbook.LinearSystem):
-    def sample_start(self, key):
-        return self.start + jax.random.normal(key, (2,))
-
-
 def test_candidates_have_starts_of_their_own_and_no_noise_on_actions(key):
-    cost = mg.open_loop(RandomStart(), 0.1)
+    cost = mg.open_loop(textbook.RandomStart(), 0.1)
     actions, starts = jax.vmap(lambda k: cost.silence(cost.sample_noise(k)))(jax.random.split(key, 50))
     np.testing.assert_array_equal(actions, 0)
     assert len(np.unique(starts[:, 0])) == 50
-
-
-def test_a_method_is_resumed(tmp_path, key):
-    method = functools.partial(search, objective, START, key, num_steps=20)
-
-    def kill(step, _):
-        if step >= 10:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        method(checkpoint=tmp_path / "run.npz", log=kill)
-    resumed = method(checkpoint=tmp_path / "run.npz")
-    straight = method()
-    np.testing.assert_array_equal(resumed.params, straight.params)
-    np.testing.assert_array_equal(resumed.history.cost, straight.history.cost)
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"num_elite": 41}, "num_elite must be at least 2 and at most num_samples = 40, got 41"),
-        ({"stddev": -0.1}, "stddev must be positive"),
-        ({"stddev": jnp.ones(3)}, "stddev must be one number or 2"),
-    ],
-)
-def test_settings_without_meaning_are_refused(key, settings, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        search(objective, START, key, num_steps=1, **settings)
-
-
-def test_a_policy_needs_a_width(key):
-    policy = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
-    closed_loop = mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, 0.3, params=policy)
-    with pytest.raises(ValueError, match="stddev must be given for ClosedLoop"):
-        cross_entropy(closed_loop, jnp.zeros(3), key, num_samples=4, num_elite=2, num_steps=1)

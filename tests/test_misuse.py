@@ -15,13 +15,21 @@ SETUP = """
 import functools, json, sys, tempfile
 import equinox as eqx, jax, jax.numpy as jnp, numpy as np, optax
 import mjxgrad as mg
-from mjxgrad import estimators
+from mjxgrad import diagnostics, envs, estimators, identification as fit, planning
+from mjxgrad.estimators import rules
+from mjxgrad.identification.parameters import Coordinates
+from mjxgrad.identification.recording import stack
+from mjxgrad.stepping import check_contact, own_motion
 
 key, params = jax.random.key(0), jnp.array([1.0, 2.0])
 noisy = mg.parameter_noise(lambda x: x @ x, 0.1)
 scene = mg.load_scene("<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody>"
                       "<actuator><motor joint='joint'/></actuator></mujoco>".replace("<joint ", "<joint name='joint' "))
 state = mg.initial_state(scene)
+balls = mg.load_scene("<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/><geom name='lamp' size='.1' contype='0' "
+                      "conaffinity='0'/><body><freejoint name='root'/><geom name='ball' size='.1'/></body><body pos='1 0 1'>"
+                      "<freejoint/><geom name='other' size='.1'/></body></worldbody></mujoco>")
+still = mg.initial_state(balls, qpos=balls.data.qpos.at[2].set(1.0))
 archive = tempfile.mkdtemp() + "/run.npy"
 np.save(archive, np.zeros(3))
 
@@ -33,15 +41,71 @@ def first(cost=None, count=8, at=params, key=key, objective=None):
 
 def optimise(**how):
     given = {"estimator": functools.partial(estimators.first_order, num_samples=4), "optimiser": optax.sgd(0.1), "num_steps": 2}
-    return mg.optimise(noisy, how.pop("at", params), how.pop("key", key), **given | how)
+    return mg.optimise(how.pop("objective", noisy), how.pop("at", params), how.pop("key", key), **given | how)
 
 
 def task(cost):
     return mg.SceneTask(scene, state, cost, 2).run(jnp.zeros((2, 1)))
 
 
-def elite(count):
-    return mg.baselines.cross_entropy(noisy, params, key, num_samples=8, num_elite=count, num_steps=2)
+def roll(*arguments, **how):
+    return mg.rollout(scene, state, *arguments, **how)
+
+
+def zeroth(estimator=estimators.zeroth_order, **how):
+    return estimator(noisy, params, key, **how)
+
+
+def shared(**how):
+    return zeroth(estimators.first_and_zeroth_order, **how)
+
+
+def elite(count, **how):
+    return mg.baselines.cross_entropy(noisy, params, key, num_samples=8, num_elite=count, num_steps=2, **how)
+
+
+def softer(*parts, scene=balls, **how):
+    return scene.with_softness(mg.Softness(*parts, **how))
+
+
+def measured(**how):
+    given = {"params": params[None], "key": key, "softness": jnp.ones(2), "num_samples": 8}
+    return diagnostics.bias_variance(lambda width: noisy, **given | how)
+
+
+def jumps(function=lambda x: x, interval=(0.0, 1.0), **how):
+    return diagnostics.jumps_along(function, interval, **how)
+
+
+line = diagnostics.phases((0.2, 0.7), 64)
+system = planning.FunctionSystem(lambda x, u: jnp.zeros(2) + u.sum(), 2, 2)
+
+
+def planned(**how):
+    given = {"controls": np.zeros((3, 2)), "smoother": planning.Exact(), "schedule": np.ones(1), "key": key}
+    return planning.optimise_trajectory(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), jnp.zeros(2), **given | how)
+
+
+def sampled(**how):
+    given = {"stddev_state": 0.1, "stddev_control": 0.1, "num_samples": 10, "order": "zeroth"}
+    return planning.Sampled(**given | how).linear_model(system, jnp.zeros(2), jnp.zeros(2), key)
+
+
+five, wrong = np.zeros(5), np.zeros((3, 1))
+
+
+def identify(measured=five, recordings=None, **how):
+    recordings = [fit.Recording({"qpos": measured})] if recordings is None else recordings
+    return mg.identify(scene, {"a": fit.Parameter(1.0)}, recordings, **how)
+
+
+cart = envs.load("diffrl_cartpole")
+
+
+def elite_policy():
+    policy, zero = mg.linear_policy(2, 1)
+    noisy = mg.closed_loop(mg.SceneTask(scene, state, len, 2), policy, 0.3, params=zero)
+    return mg.baselines.cross_entropy(noisy, zero, key, num_samples=4, num_elite=2, num_steps=1)
 
 
 def answer(call):
@@ -102,6 +166,157 @@ FOUND = {
     "mg.load_scene('<mujoco/>', softness=1e4)": "softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got 10000.0",
     "mg.rollout(scene, state, horizon=2, contact='slope')": 'mg.Onset() or mg.Smoothing(), got "slope"',
     "mg.Softness(geoms='ball')": "geoms must be a tuple of names, got 'ball'; write ('ball',)",
+    # Rollouts, and where they begin.
+    "roll(jnp.zeros((4, 2)))": "controls must have shape (4, 1)",
+    "roll(jnp.array([[0.0], [jnp.nan]]))": "controls must be finite, got nan in step 1 for actuator 0",
+    "roll(jnp.zeros((4, 1)), noise=jnp.zeros((3, 1)))": "must agree on the number of steps, got controls 4",
+    "roll()": "horizon must be given",
+    "roll(horizon=0)": "horizon must be at least 1, got 0",
+    "roll(lambda p, s: jnp.array(1.0), horizon=2)": "must return one control per actuator, shape (1,), got",
+    "roll(lambda p, s: jnp.arange(4.0), horizon=2)": "must return one control per actuator, shape (1,), got",
+    "roll(horizon=2, contact=mg.Discrete('mujoco'), observe=lambda m, d: d.qpos)": "observe must be left out where C MuJoCo",
+    "roll(horizon=2, inputs={'ctrl': jnp.zeros((2, 2))})": "inputs must be among qfrc_applied",
+    "roll(horizon=2, inputs={'qfrc_applied': jnp.zeros(3)})": "inputs['qfrc_applied'] must have shape (2, 1), one row per step",
+    "mg.initial_state(scene, qpos=jnp.zeros(3))": "qpos must have shape (1,) in this scene, got (3,)",
+    "mg.initial_state(balls, qpos=jnp.zeros(14))": "quaternion that is not zero, got zeros for root",
+    "mg.initial_state(scene, qpos=jnp.array([jnp.nan]))": "qpos must be finite",
+    "mg.initial_state(scene, qvel=jnp.array([jnp.inf]))": "qvel must be finite",
+    # Contact in a step.
+    "mg.Discrete('warp')": "engine must be \"mjx\", \"mujoco\" or None, got 'warp'",
+    "mg.Onset(-0.1)": "width must be finite and not negative",
+    "mg.Onset(jnp.nan)": "width must be finite and not negative",
+    "mg.step(balls.model, balls.data, contact=mg.Onset(jnp.ones(3)))": "width must be one value",
+    "mg.Smoothing(0.0)": "length must be positive and finite, got 0.0",
+    "mg.Smoothing([1e-3, jnp.inf])": "length must be positive",
+    "mg.Smoothing(1e-3, mode='both')": "mode must be one of 'forward', 'backward', got 'both'",
+    "mg.step(balls.model, balls.data, contact=mg.Smoothing([1e-3, 2e-3]))": "length must be one value for a step, got",
+    "mg.step(balls.model, balls.data, contact=mg.Slope('mujoco'))": 'engine None or "mjx" in a step of MJX, got "mujoco"',
+    "check_contact('slope')": 'mg.Slope(), mg.Onset() or mg.Smoothing(), got "slope"',
+    "own_motion('event')": "gradient must be one of 'discrete', 'slope', got 'event'",
+    "mg.contact_force(balls.model, balls.data, 'floor', 'bal')": "no geom 'bal'; named geoms are 'floor', 'lamp', 'ball'",
+    "mg.contact_force(balls.model, balls.data, 'floor', 'lamp')": "can never touch",
+    # Softness.
+    "mg.Softness(stiffness=0.0)": "stiffness must be positive",
+    "mg.Softness(damping_ratio=-1)": "damping_ratio must be at least 0",
+    "mg.Softness(impedance=1.5)": "impedance must be between 0 and 1",
+    "mg.Softness(width=0)": "width must be positive",
+    "mg.Softness(margin=-0.1)": "margin must be finite and at least 0",
+    "mg.Softness(margin=jnp.nan)": "margin must be finite",
+    "mg.Softness(rest_acceleration=9.81)": "must come with a margin",
+    "mg.Softness(margin=0.1, rest_acceleration=0)": "rest_acceleration must be positive",
+    "mg.Softness(geoms=('a',), pairs=(('a', 'b'),))": "either geoms or pairs",
+    "softer(9e2, 1.0, geoms=('flor',))": "those that can: ",
+    "softer(9e2, 1.0, pairs=(('ball', 'flor'),))": "those that can: ",
+    "softer(9e2, 1.0, pairs=(('ball', 'floor'),))": "would also change the pair",
+    "balls.with_softness(mg.Softness(stiffness=[1, 2], damping_ratio=1))": "stiffness must be one value",
+    # Scenes.
+    "mg.load_scene(3)": "source must be an MJCF file",
+    "mg.load_scene('nowhere.xml')": "source must be",
+    "mg.load_scene('.')": "got the folder",
+    "mg.load_scene('<mujoco/>', timestep=0.0)": "timestep must be positive",
+    "mg.load_scene('<mujoco><option timestep=\"nan\"/></mujoco>')": "must have a positive time step, got",
+    "mg.load_scene('<mujoco><worldbody><body><joint/><geom size=\".1\" friction=\"nan 0 0\"/></body></worldbody></mujoco>')":
+        "must hold numbers, got NaN in geom_friction",
+    "jax.vmap(balls.with_softness)(mg.Softness(stiffness=[1e2, 1e3], damping_ratio=[1, 1])).summary()":
+        "one scene with known values",
+    "mg.load_scene('<mujoco><worldbody><geom size=\".1\"/></worldbody></mujoco>')": "got none (nv = 0)",
+    "scene.with_model(dof_dampng=jnp.ones(1))": "numbers of the MJX model, got dof_dampng; did you mean dof_damping",
+    "scene.with_model(geom_type=jnp.ones(1))": "must name arrays of numbers of the MJX model, got geom_type",
+    "scene.with_model(dof_damping=5.0)": "dof_damping must have shape (1,) in this scene, got ()",
+    "scene.with_model(body_mass=jnp.array([0.0, -1]))": "body_mass must not be negative, got -1",
+    "scene.with_model(geom_size=jnp.array([[-0.1, 0, 0]]))": "geom_size must not be negative, got -0.1",
+    "scene.with_model(timestep=0.0)": "timestep must be positive, got 0",
+    "mg.load_scene(balls.mj_model, max_contacts=0)": "max_contacts must be at least 1, got 0; None has room for all",
+    "mg.check_stability(balls, speed=0.0)": "speed must be positive",
+    "mg.check_stability(balls, speed=float('nan'))": "speed must be positive",
+    # Objectives and estimators.
+    "first(count=1)": "num_samples must be at least 2, got 1",
+    "zeroth(num_samples=-3)": "num_samples must be at least 2, got -3",
+    "shared(num_samples=8, chunk_size=0)": "chunk_size must be at least 1, got 0",
+    "zeroth(num_samples=7, antithetic=True)": "num_samples must be even with antithetic pairs, got 7",
+    "shared(num_samples=2, antithetic=True)": "num_samples must be at least 4 with antithetic pairs, got 2",
+    "shared(num_samples=8, baseline='mean')": "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'",
+    "first(objective=mg.parameter_noise(jnp.sum, 0.1, dim=1))": "params must have shape (1,), got (2,)",
+    "first(at={'force': 1})": "params must have floating-point arrays",
+    "mg.parameter_noise(jnp.sum, 0.0)": "stddev must be positive, got",
+    "mg.parameter_noise(jnp.sum, float('nan'))": "stddev must be positive, got",
+    "mg.parameter_noise(jnp.sum, jnp.array([0.1, 0.2]), dim=3)": "stddev must be one number or 3, got shape (2,)",
+    "noisy.sample_noise(key)": "dim is not known: pass dim",
+    "mg.open_loop(mg.SceneTask(scene, state, len, 4), jnp.ones(3))": "stddev must broadcast to (horizon, nu) = (4, 1), got (3,)",
+    "mg.open_loop(mg.SceneTask(balls, still, len, 4), 0.1)": "action noise needs controls, got a task of (horizon, nu) = (4, 0)",
+    "rules.Consistent(failure_probability=0.95)": "failure_probability must be above 0 and at most 0.2, got 0.95",
+    "rules.BiasConstrained(1.0, bound=1.0, failure_probability=1.0)": "failure_probability must be above 0 and at most 1.0",
+    "mg.linear_policy(3, 1)[0](mg.linear_policy(3, 1)[1], jnp.zeros(2))": "must observe 3 numbers, got shape (2,)",
+    "mg.linear_policy(3, 1)[0](mg.linear_policy(3, 1)[1], {'x': 0})": "state must be a vector or a State, got dict",
+    "mg.linear_policy(3, 0)": "num_controls must be at least 1, got 0",
+    # Optimisation and search.
+    "optimise(num_steps=0)": "num_steps must be at least 1, got 0",
+    "optimise(evaluate_every=0)": "evaluate_every must be at least 1, got 0",
+    "optimise(annealing=optax.constant_schedule(1.0))": "objective must be a function from a scale",
+    "optimise(checkpoint='/nowhere/at/all.npz')": "checkpoint must be in a folder that exists",
+    "optimise(at=jnp.zeros((3, 2)))": "params must have a leading axis only where key has the same",
+    "optimise(at=jnp.zeros((3, 2)), key=jax.random.split(key, 4))": "params must have a leading axis only where key has the same",
+    "optimise(at=jnp.zeros(()))": "params must be a vector of shape",
+    "optimise(objective=lambda x: x @ x)": "objective must be an Objective, got function; wrap a function by",
+    "elite(9)": "num_elite must be at least 2 and at most num_samples = 8, got 9",
+    "elite(2, stddev=-0.1)": "stddev must be positive",
+    "elite(2, stddev=jnp.ones(3))": "stddev must be one number or 2",
+    "elite_policy()": "stddev must be given for ClosedLoop",
+    # Diagnostics.
+    "measured(params=params)": "params must have shape (points, dim), got (2,)",
+    "measured(num_samples=1)": "num_samples must be at least 2, got 1",
+    "measured(num_reference=3)": "num_reference must be at least 4, got 3",
+    "measured(softness={'a': jnp.ones(2), 'b': jnp.ones(3)})": "softness must have the same leading axis in every leaf",
+    "measured(confidence=95.0)": "confidence must be between 0 and 1, got 95.0",
+    "jumps(interval=(1.0, 1.0))": "interval must be two finite numbers",
+    "jumps(num_points=100)": "num_points must be a multiple of num_candidates",
+    "jumps(num_refinements=0)": "num_refinements must be at least 1",
+    "jumps(lambda x: 1.0)": "function must return one value per parameter",
+    "diagnostics.phases((0.3, 0.3), 64)": "interval must be two finite numbers",
+    "diagnostics.phases((0.0, np.inf), 64)": "interval must be two finite numbers",
+    "diagnostics.phases((0.0, 1.0), 31)": "num_phases must be at least 32, got 31",
+    "diagnostics.compare_to_slope(line, line, [line[:-1]], ['short'])": "derivatives must hold one array",
+    "diagnostics.compare_to_slope(line[::-1], line, [line], ['backwards'])": "parameters must be at least 32 and increase",
+    # Planning.
+    "planned(schedule=np.zeros(0))": "schedule must be one factor per iteration",
+    "planned(schedule=np.array([1.0, 0.0]))": "schedule must be positive, got 0: for no smoothing take Exact()",
+    "planned(lower=1.0, upper=0.0)": "lower must be at most upper",
+    "planned(controls=np.zeros((3, 1)))": "controls must have shape (horizon, 2)",
+    "sampled(stddev_state=-1.0)": "stddev_state must be at least 0",
+    "sampled(stddev_control=jnp.ones(3))": "stddev_control must be a number or have shape",
+    "sampled(num_samples=4)": "num_samples must be at least 6",
+    "system.with_contact(mg.Smoothing(0.1))": "analytic smoothing must be of a SceneSystem, got FunctionSystem",
+    # Identification.
+    "fit.Recording({'qpos': wrong}, times=[0, 1])": "measured and times of the recording must have the same number",
+    "fit.Recording({'qpos': np.zeros(2)}, times=[1, 0])": "times of the recording must increase",
+    "fit.Recording({'qpos': five}, noise={'qpso': 1})": "noise of the recording must name measured signals",
+    "fit.Recording({'qpos': five}, noise={'qpos': 0.0})": "noise of qpos of the recording must be positive",
+    "fit.Recording({'sensor': five}).cut(0.1, 0.01)": "must have measured qpos and qvel to be cut",
+    "fit.Recording({'qpos': np.zeros(3)}, wrong)": "4 rows for 3 controls, one at each state",
+    "stack(scene, [fit.Recording({'qpos': five}, wrong, 0.01 * np.arange(5))])": "controls of the recording must have a row",
+    "stack(scene, [fit.Recording({'qpos': five}, np.zeros((4, 2)))])": "must have 1 columns in this scene",
+    "stack(scene, [fit.Recording({'qvel': np.zeros((5, 2))})])": "qvel of the recording must have 1 columns",
+    "stack(scene, [fit.Recording({'speed': five})])": "there is no sensor 'speed'",
+    "identify(recordings=[])": "recordings must hold at least one",
+    "identify(np.full(5, np.nan))": "got NaN alone",
+    "identify(delay='b')": "delay must name one",
+    "fit.Parameter(3.0, 0.0, 1.0)": "lower, nominal and upper must increase",
+    "fit.Parameter([1.0, 2.0], [0.0, 0.0, 0.0])": "lower must be one number or of shape",
+    "fit.Parameter(np.nan)": "nominal must be finite",
+    "fit.armature(scene, 'joint')": "bounds of armature must be given",
+    "fit.mass(scene, 'leg')": "there is no body 'leg'; named bodies are 'world'",
+    "fit.softness(scene, 'hardness')": "part must be one of stiffness, damping_ratio, width",
+    "Coordinates.of({})": "parameters must name at least one",
+    # Environments.
+    "cart.step(cart.reset(key), jnp.zeros(2))": "action must have shape (1,), got (2,)",
+    "envs.diffrl.CartPole(scene, frame_skip=0)": "frame_skip must be at least 1, got 0",
+    "envs.diffrl.CartPole(scene, episode_length=0)": "episode_length must be at least 1, got 0",
+    "cart.refined(0)": "times must be at least 1, got 0",
+    "mg.learning.learn([], key, num_updates=1)": "one or several, got an empty sequence",
+    "mg.learning.Settings(window=0)": "window must be at least 1, got 0",
+    "mg.learning.Settings(discount=1.5)": "discount must be from 0 to 1, got 1.5",
+    "mg.learning.Settings(stddev=(0.1, 0.0))": "stddev must be positive",
+    "mg.learning.Settings(critic_batches=5)": "critic_batches must divide the 2048 states of an update, got 5",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",

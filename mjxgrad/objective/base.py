@@ -175,7 +175,6 @@ def value_and_gradient(
     function: Callable[[Vector], Any], point: Vector, *, has_aux: bool = False
 ) -> tuple[Any, Vector]:
     """Differentiate as `jax.value_and_grad` does, in forward mode up to three dimensions if the function has one."""
-
     if point.size <= MOST_FORWARD_DIMENSIONS:
         along = functools.partial(jax.jvp, function, (point,), has_aux=has_aux)
         out_axes = (None, 0, None) if has_aux else (None, 0)

@@ -9,11 +9,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad.batched import cholesky
 
-_WAYS = {
-    "written out": cholesky.written_out,
-    "in blocks": cholesky.in_blocks,
-    "chosen": cholesky.cholesky_solve,
-}
+_WAYS = {"written out": cholesky.written_out, "in blocks": cholesky.in_blocks, "chosen": cholesky.cholesky_solve}
 
 
 def _systems(size: int, num: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,5 @@
 """The smooth stages against C MuJoCo, against MJX, and their derivatives against each other."""
 
-from pathlib import Path
-
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -11,8 +8,8 @@ import pytest
 
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import forces, kinematics
+from tests.scenes import ASSETS
 
-ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 # Sums of some tens of products of numbers of order one, in another order than the reference takes them.
 ROUNDING = 1e3 * np.finfo(float).eps
 # Every joint type, several joints on a body, fixed and offset bodies, two trees, a mocap body with a body fixed to it.
@@ -71,31 +68,12 @@ PLACES = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis")
 PLACED = ("geom_xpos", "geom_xmat", "site_xpos", "site_xmat")
 MOTIONS = ("subtree_com", "cinert", "crb", "cdof", "cvel", "cdof_dot")
 FORCES = (
-    "qfrc_bias",
-    "qfrc_passive",
-    "actuator_length",
-    "actuator_force",
-    "qfrc_actuator",
-    "qfrc_smooth",
-    "qacc_smooth",
-)
+    "qfrc_bias", "qfrc_passive", "actuator_length", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qacc_smooth",
+)  # fmt: skip
 LEAVES = (
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "body_iquat",
-    "body_pos",
-    "body_quat",
-    "geom_pos",
-    "jnt_pos",
-    "jnt_axis",
-    "jnt_stiffness",
-    "dof_armature",
-    "dof_damping",
-    "qpos_spring",
-    "actuator_gear",
-    "actuator_gainprm",
-)
+    "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat", "geom_pos", "jnt_pos", "jnt_axis",
+    "jnt_stiffness", "dof_armature", "dof_damping", "qpos_spring", "actuator_gear", "actuator_gainprm",
+)  # fmt: skip
 
 
 def load(name):

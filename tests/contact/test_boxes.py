@@ -75,7 +75,7 @@ def test_two_boxes_touch_where_they_do_in_c(margin):
 def test_a_square_turned_on_a_square_touches_at_an_octagon():
     """A square of side 2 turned by 45° within another: corners at (±1, ±(√2 - 1)) and the same exchanged."""
     half, turn = jnp.array([1.0, 1.0, 0.25]), np.sqrt(0.5) * np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]])
-    dist, pos, frame = box_box(
+    dist, pos, frame = jax.jit(box_box)(
         Box(jnp.zeros(3), jnp.eye(3), half), Box(jnp.array([0, 0, 0.49]), jnp.asarray(turn), half)
     )
     near = np.sqrt(2) - 1
@@ -97,7 +97,7 @@ def test_crossing_edges_touch_at_one_point():
     """Bars along x and y on edge: where the edges cross, half way between them."""
     half = jnp.array([1.0, 0.1, 0.1])
     x, axes = map(jnp.asarray, _crossing())
-    dist, pos, frame = box_box(*_boxes(x, axes, (half, half)))
+    dist, pos, frame = jax.jit(box_box)(*_boxes(x, axes, (half, half)))
     np.testing.assert_allclose(dist, [-0.01 * np.sqrt(2), *[ABSENT] * 7], atol=1e-14)
     np.testing.assert_allclose(pos[0], [0.02, 0, 0.095 * np.sqrt(2)], atol=1e-14)
     np.testing.assert_allclose(frame[0, 0], [0, 0, 1], atol=1e-14)
@@ -128,7 +128,8 @@ def test_the_contacts_of_boxes_have_the_derivative_of_their_points(kind):
     rest = jnp.zeros(6)
     acting = int(jnp.sum(outcome(rest)[:8] < ABSENT))
     assert acting == 1 if kind == "edge" else acting >= 6
-    np.testing.assert_allclose(jax.jacrev(outcome)(rest), central_difference(outcome, rest, 1e-6), atol=1e-7)
+    both = jax.jit(lambda x: (jax.jacrev(outcome)(x), central_difference(outcome, x, 1e-6)))
+    np.testing.assert_allclose(*both(rest), atol=1e-7)
 
 
 def test_derivatives_are_finite_in_single_precision():
@@ -182,9 +183,9 @@ def test_data_of_mjx_has_room_for_the_four_deepest():
     scene = mg.load_scene(STACK)
     turned = scene.data.qpos.at[10:].set(jnp.array([np.cos(0.3), 0.002, 0.001, np.sin(0.3)]))
     found = []
+    find = jax.jit(lambda data: collide(scene.model, mjx.kinematics(scene.model, data))._impl.contact)
     for data in (scene.data, mjx.make_data(scene.mj_model)):
-        data = mjx.kinematics(scene.model, data.replace(qpos=turned))
-        contact = collide(scene.model, data)._impl.contact
+        contact = find(data.replace(qpos=turned))
         found.append(np.sort(np.asarray(contact.dist)[(np.asarray(contact.geom) == (1, 2)).all(axis=1)]))
     assert [*map(len, found)] == [8, 4]
     np.testing.assert_allclose(found[1], found[0][:4], atol=1e-14)

@@ -38,94 +38,78 @@ BALLS = """
 """
 
 
+CAN = """
+<mujoco><worldbody><body><freejoint/><geom size=".07" margin="5"/></body>
+<body><freejoint/><geom type="cylinder" size=".1 .15"/></body></worldbody></mujoco>
+"""
+BALL_AND_BOX = CAN.replace('type="cylinder" size=".1 .15"', 'type="box" size=".1 .2 .05"').replace(".07", ".03")
+
+
 def _finder(model):
     return jax.jit(
         lambda data: collide(model, kinematics.com_pos(model, kinematics.kinematics(model, data)))._impl.contact
     )
 
 
-def _poses(seed, num_boxes=2):
+def _poses(seed, num_bodies=2):
     random = np.random.default_rng(seed)
-    quaternions = random.normal(size=(num_boxes, 4))
+    quaternions = random.normal(size=(num_bodies, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return np.concatenate([random.normal(scale=0.1, size=(num_boxes, 3)), quaternions], axis=1).ravel()
+    return np.concatenate([random.normal(scale=0.1, size=(num_bodies, 3)), quaternions], axis=1).ravel()
 
 
-def test_a_box_on_a_plane_touches_where_it_does_in_c():
-    mj_model = mujoco.MjModel.from_xml_string(BOXES)
-    mj_data = mujoco.MjData(mj_model)
+def _loaded(xml):
+    mj_model = mujoco.MjModel.from_xml_string(xml)
     model = mjx.put_model(mj_model)
-    start, find, geoms = mjx.make_data(mj_model), _finder(model), slot_geoms(model, mjx.make_data(mj_model))
-    for seed in range(20):
-        mj_data.qpos[:] = _poses(seed)
-        mujoco.mj_forward(mj_model, mj_data)
-        contact = find(start.replace(qpos=jnp.asarray(mj_data.qpos)))
-        ours = np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]])
-        theirs = np.column_stack(
-            [mj_data.contact.geom, mj_data.contact.dist, mj_data.contact.pos, mj_data.contact.frame[:, :3]]
-        )
-        # Two planes, two boxes, four corners each: in C's order after sorting by pair and depth.
-        assert len(theirs) == 16
-        order = [np.lexsort((found[:, 2], found[:, 1], found[:, 0])) for found in (ours, theirs)]
-        np.testing.assert_allclose(ours[order[0]], theirs[order[1]], atol=1e-14)
+    return mj_model, mjx.make_data(mj_model), _finder(model), slot_geoms(model, mjx.make_data(mj_model))
 
 
-def test_the_contacts_of_a_box_have_the_derivative_of_its_corners():
-    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOXES))
-    start, find = mjx.make_data(model), _finder(model)
-
-    def outcome(qpos):
-        contact = find(start.replace(qpos=qpos))
-        return jnp.concatenate([contact.dist, contact.pos.ravel()])
-
-    qpos = jnp.asarray(_poses(7))
-    # Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5.
-    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-9)
-
-
-CAN = """
-<mujoco><worldbody><body><freejoint/><geom size=".07" margin="5"/></body>
-<body><freejoint/><geom type="cylinder" size=".1 .15"/></body></worldbody></mujoco>
-"""
-
-
-def _can():
-    mj_model = mujoco.MjModel.from_xml_string(CAN)
-    model = mjx.put_model(mj_model)
-    return mj_model, mjx.make_data(mj_model), _finder(model)
-
-
-def test_a_ball_on_a_cylinder_touches_where_it_does_in_c():
-    """On the side, an end and the edge between, from outside and from within."""
-    mj_model, start, find = _can()
+@pytest.mark.parametrize(
+    ("xml", "num_contacts", "num_places"),
+    [(BOXES, 16, 1), (CAN, 1, 4), (BALL_AND_BOX, 1, 8)],
+    ids=["two boxes on two planes, corner by corner", "side, ends and edge of a cylinder", "around and within a box"],
+)
+def test_they_touch_where_they_do_in_c(xml, num_contacts, num_places):
+    """Pairs, distances, places and normals, in C's order after sorting by pair and depth; from outside and from within."""
+    mj_model, start, find, geoms = _loaded(xml)
     mj_data, places = mujoco.MjData(mj_model), set()
-    for seed in range(60):
+    for seed in range(100):
         mj_data.qpos[:] = _poses(seed)
         mujoco.mj_forward(mj_model, mj_data)
-        contact = find(start.replace(qpos=jnp.asarray(mj_data.qpos)))
-        ours = np.concatenate([contact.dist, contact.pos[0], contact.frame[0, 0]])
-        theirs = np.concatenate([mj_data.contact.dist, mj_data.contact.pos[0], mj_data.contact.frame[0, :3]])
-        np.testing.assert_allclose(ours, theirs, atol=1e-14)
-        centre = mj_data.geom_xmat[1].reshape(3, 3).T @ (mj_data.geom_xpos[0] - mj_data.geom_xpos[1])
-        places.add((np.hypot(*centre[:2]) > 0.1, abs(centre[2]) > 0.15))
-    assert len(places) == 4
+        contact, theirs = find(start.replace(qpos=jnp.asarray(mj_data.qpos))), mj_data.contact
+        found = [
+            np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]]),
+            np.column_stack([theirs.geom, theirs.dist, theirs.pos, theirs.frame[:, :3]]),
+        ]
+        assert len(theirs) == num_contacts
+        ours, theirs = (x[np.lexsort((x[:, 2], x[:, 1], x[:, 0]))] for x in found)
+        # The nearest side of a box that a ball's centre is within 1e-5 of is known to 1e-14 over that.
+        np.testing.assert_allclose(ours, theirs, atol=1e-9 if xml is BALL_AND_BOX else 1e-14)
+        if xml is not BOXES:
+            centre = mj_data.geom_xmat[1].reshape(3, 3).T @ (mj_data.geom_xpos[0] - mj_data.geom_xpos[1])
+            round_it = np.array([np.hypot(*centre[:2]), abs(centre[2])]) if xml is CAN else np.abs(centre)
+            places.add(tuple(round_it > ([0.1, 0.15] if xml is CAN else mj_model.geom_size[1])))
+    assert len(places) == num_places or xml is BOXES
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_the_contact_of_a_ball_on_a_cylinder_has_the_derivative_of_its_point(seed):
-    _, start, find = _can()
+@pytest.mark.parametrize(("xml", "seeds"), [(BOXES, [7]), (CAN, range(4))], ids=["boxes", "cylinder"])
+def test_contacts_have_the_derivative_of_their_points(xml, seeds):
+    _, start, find, _ = _loaded(xml)
 
     def outcome(qpos):
         contact = find(start.replace(qpos=qpos))
-        return jnp.concatenate([contact.dist, contact.pos.ravel(), contact.frame[0, 0]])
+        normal = contact.frame[0, 0] if xml is CAN else jnp.zeros(0)
+        return jnp.concatenate([contact.dist, contact.pos.ravel(), normal])
 
-    qpos = jnp.asarray(_poses(seed))
-    np.testing.assert_allclose(jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5), atol=1e-7)
+    both = jax.jit(lambda qpos: (jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5)))
+    # Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5; normals are divided by distances.
+    for seed in seeds:
+        np.testing.assert_allclose(*both(jnp.asarray(_poses(seed))), atol=1e-7 if xml is CAN else 1e-9)
 
 
 def test_on_its_axis_a_ball_on_a_cylinder_has_a_derivative():
     """Upright, centres one above the other: the distance is the height less what is between, whichever way it moves."""
-    _, start, find = _can()
+    _, start, find, _ = _loaded(CAN)
     upright = jnp.array([0, 0, 0.21, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0], float)
     slope = jax.jacrev(lambda qpos: find(start.replace(qpos=qpos)).dist[0])(upright)
     np.testing.assert_allclose(slope[:3], [0, 0, 1], atol=1e-14)
@@ -176,7 +160,7 @@ def test_contacts_of_two_faces_lie_half_way_between_them_as_in_c(kind):
     </mujoco>""")
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
-    found = mg.forward(scene.model, scene.data)._impl.contact
+    found = jax.jit(mg.forward)(scene.model, scene.data)._impl.contact
     acts = np.asarray(found.dist) < 0
     ours, theirs = np.asarray(found.pos)[acts].round(9), data.contact.pos.round(9)
     assert len(ours) == len(theirs) == 4
@@ -192,7 +176,7 @@ def test_a_mesh_that_stands_on_three_corners_has_their_contacts():
         <geom type="mesh" mesh="prism"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
-    found = mg.forward(scene.model, scene.data)._impl.contact
+    found = jax.jit(mg.forward)(scene.model, scene.data)._impl.contact
     acts = np.asarray(found.dist) < 0
     ours, theirs = (np.unique(x.round(6), axis=0) for x in (np.asarray(found.pos)[acts], data.contact.pos))
     assert acts.sum() == data.ncon == len(theirs) == 3

@@ -127,17 +127,6 @@ def test_the_margin_of_selected_pairs_is_theirs_alone(three):
         three.with_softness(Softness(margin=0.006, pairs=(("two", "three"),)))
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [({"margin": -0.1}, "margin must be finite and at least 0"), ({"margin": np.nan}, "margin must be finite"),
-     ({"rest_acceleration": 9.81}, "must come with a margin"),
-     ({"margin": 0.1, "rest_acceleration": 0}, "rest_acceleration must be positive")],
-)  # fmt: skip
-def test_margins_without_meaning_are_refused(parts, message):
-    with pytest.raises(ValueError, match=message):
-        Softness(**parts)
-
-
 def test_a_height_is_not_kept_twice_over(pyramids):
     """The stiffness of a contact with a margin may be a compensated one; halving it again would say nothing."""
     once = pyramids.with_softness(_with(SOFT, margin=0.02, rest_acceleration=GRAVITY))

@@ -139,21 +139,6 @@ def test_the_table_says_what_is_biased_and_how_large(jumps):
     assert any(cell.strip().endswith("*") for cell in cells)
 
 
-def test_the_picture_has_every_estimate_and_axes_with_units(jumps):
-    pyplot = pytest.importorskip("matplotlib.pyplot")
-    pyplot.switch_backend("Agg")
-    figure = jumps[0].plot()
-    (upper, *_), (lower, *_) = np.array(figure.axes).reshape(2, 3)
-    assert [text.get_text() for text in upper.get_legend().get_texts()][-3:] == [
-        "first order",
-        "zeroth order",
-        "α-order",
-    ]
-    assert lower.get_xlabel() == "number"
-    assert lower.get_ylabel() == "variance of one rollout"
-    pyplot.close(figure)
-
-
 def test_the_landscape_is_the_cost(jumps):
     table, _, _ = jumps
     x = table.landscape.points
@@ -234,24 +219,6 @@ def test_a_cost_that_is_not_finite_leaves_no_reference_within_reach():
     near, far = (landscape.smoothed_gradient(jnp.array(x), jnp.array(STDDEV), jnp.array(0.0))[0] for x in (0.9, 0.2))
     assert np.isnan(near)
     assert abs(far - 1) < 0.01
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"params": jnp.array([0.1])}, r"params must have shape \(points, dim\), got \(1,\)"),
-        ({"num_samples": 1}, "num_samples must be at least 2, got 1"),
-        ({"num_reference": 3}, "num_reference must be at least 4, got 3"),
-        ({"softness": {"a": jnp.ones(2), "b": jnp.ones(3)}}, "softness must have the same leading axis in every leaf"),
-        ({"confidence": 95.0}, "confidence must be between 0 and 1, got 95.0"),
-    ],
-)
-def test_bad_arguments_are_answered_with_what_is_right(arguments, sentence):
-    good = {"params": POINTS, "softness": WIDTHS, "num_samples": 8}
-    with pytest.raises(ValueError, match=sentence):
-        bias_variance(
-            lambda width: parameter_noise(textbook.ramp(width), STDDEV), key=jax.random.key(0), **(good | arguments)
-        )
 
 
 def test_intervals_of_means_cover_as_often_as_they_say():

@@ -42,18 +42,3 @@ def test_of_more_jumps_than_candidates_the_largest_remain():
 def test_beside_what_is_not_finite_no_jump_is_claimed():
     found = jumps_along(lambda x: np.where(x > 0.5, np.nan, 1.0 * (x > 0.25)), (0.0, 1.0))
     assert found.places == pytest.approx([0.25])
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"interval": (1.0, 1.0)}, "interval must be two finite numbers"),
-        ({"num_points": 100}, "num_points must be a multiple of num_candidates"),
-        ({"num_refinements": 0}, "num_refinements must be at least 1"),
-        ({"function": lambda x: 1.0}, "function must return one value per parameter"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(settings, sentence):
-    arguments = {"function": lambda x: x, "interval": (0.0, 1.0)} | settings
-    with pytest.raises(ValueError, match=sentence):
-        jumps_along(arguments.pop("function"), arguments.pop("interval"), **arguments)

@@ -109,24 +109,3 @@ def test_an_error_of_rounding_alone_is_none():
     x = phases(INTERVAL, 64)
     found = compare_to_slope(x, np.ones(64), [np.full(64, 1e-16), np.zeros(64)], ["a", "b"])
     assert found.relative_error.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize(
-    ("interval", "num_phases", "sentence"),
-    [
-        ((0.3, 0.3), 64, "interval must be two finite numbers"),
-        ((0.0, np.inf), 64, "interval must be two finite numbers"),
-        ((0.0, 1.0), 31, "num_phases must be at least 32, got 31"),
-    ],
-)
-def test_an_interval_or_a_number_without_meaning_is_refused(interval, num_phases, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        phases(interval, num_phases)
-
-
-def test_shapes_that_do_not_fit_are_refused():
-    x = phases(INTERVAL, 64)
-    with pytest.raises(ValueError, match="derivatives must hold one array"):
-        compare_to_slope(x, x, [x[:-1]], ["short"])
-    with pytest.raises(ValueError, match="parameters must be at least 32 and increase"):
-        compare_to_slope(x[::-1], x, [x], ["backwards"])

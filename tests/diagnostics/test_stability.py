@@ -43,13 +43,16 @@ def test_the_load_is_the_step_over_the_closed_form_limit_in_the_standard_format(
 
 
 @pytest.mark.parametrize("share", [0.97, 1.03])
-@pytest.mark.parametrize(("integrator", "first"), [("Euler", 0.5), ("RK4", 0.5), ("Euler", 0.9)])
-def test_c_mujoco_gains_energy_in_a_held_contact_exactly_where_the_load_exceeds_one(integrator, first, share):
-    """A ball that is pressed into its contact swings ever wider, or comes to rest.
+@pytest.mark.parametrize(
+    ("integrator", "first", "damping"),
+    [("Euler", 0.9, 20), *((x, 0.5, c) for x in ("Euler", "RK4") for c in (20, 400, 800))],
+)
+def test_c_mujoco_gains_energy_in_a_held_contact_exactly_where_the_load_exceeds_one(integrator, first, damping, share):
+    """A ball that is pressed into its contact swings ever wider, or comes to rest; at damping ratios of 0.05, 1 and 2.
 
     Also near the surface of a contact whose impedance falls with depth, where stiffness goes as its square.
     """
-    solref, solimp = "-40000 -20", f"{first} .5 .5"
+    solref, solimp = f"-40000 -{damping}", f"{first} .5 .5"
     (unit,) = _report(solref=solref, solimp=solimp, integrator=integrator).springs
     step = 0.002 * share / unit.load
     model = mujoco.MjModel.from_xml_string(
@@ -59,8 +62,7 @@ def test_c_mujoco_gains_energy_in_a_held_contact_exactly_where_the_load_exceeds_
     # It rests (1 − d) a₀ / k deep, 12.5 mm at d = 0.5; start a tenth of a millimetre deeper.
     data.qpos[0] = -(1 - first) * 1000 / (40000 * (first / 0.5) ** 2) - 1e-4
     mujoco.mj_step(model, data, 400)
-    swing = np.abs(data.qvel[0])
-    assert (swing > 1.0) == (share > 1)
+    assert (np.abs(data.qvel[0]) > 0.1) == (share > 1)
 
 
 def test_a_bounce_lasts_and_goes_as_deep_as_the_closed_form_says():
@@ -143,9 +145,3 @@ def test_the_summary_names_the_scene_its_springs_and_its_warnings():
     assert "contact floor – ball" in text
     assert all(one[:40] in text for one in report.warnings)
     assert max(map(len, text.splitlines())) < 160
-
-
-@pytest.mark.parametrize("speed", [0.0, -1.0, np.nan])
-def test_a_speed_that_is_none_is_refused(speed):
-    with pytest.raises(ValueError, match="speed must be positive"):
-        _report(speed=speed)

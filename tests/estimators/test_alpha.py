@@ -122,8 +122,3 @@ def test_without_finite_derivatives_the_unbiased_part_stands_alone(key):
     assert Reason[estimate.reason] == Reason[Reason.not_finite]
     assert Diagnosis[estimate.diagnosis] == Diagnosis[Diagnosis.fine]
     assert estimate.value == 0
-
-
-def test_rollouts_are_counted_once(key):
-    estimate = alpha_order(BUMPY, POINT, key, num_samples=200)
-    assert estimate.num_rollouts == estimate.num_gradient_rollouts == 200

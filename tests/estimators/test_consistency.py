@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from mjxgrad.estimators.consistency import secant_sums
 from mjxgrad.estimators.samples import Group, plan_by_noise, sample
@@ -38,24 +37,6 @@ def test_the_sums_are_those_of_the_definition(key):
             missed += rest**2 / 2
     np.testing.assert_allclose(sums.inconsistency(), residual / difference, rtol=1e-9)
     np.testing.assert_allclose(sums.missed_variance(), missed / (40 * 39), rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "cost",
-    [lambda x: 3.0 + 0 * x[0], lambda x: 1e3 + 7 * x[0] ** 2 - 3 * x[0] * x[1] + x[1]],
-    ids=["constant", "quadratic"],
-)
-def test_nothing_of_a_constant_or_a_quadratic_is_missed(key, cost):
-    sums, _ = sums_of(cost, key)
-    assert sums.inconsistency() == 0
-    assert sums.missed_variance() == 0
-
-
-def test_what_is_missed_of_a_jump_is_its_variance(key):
-    """Half the mean square of differences of all pairs is the variance with N - 1."""
-    sums, samples = sums_of(lambda x: 2 * x[1] + jnp.where(x[0] > 0, 0.7, 0.0), key)
-    jump = np.where(np.asarray(POINT + samples.noise)[:, 0] > 0, 0.7, 0.0)
-    np.testing.assert_allclose(sums.missed_variance(), jump.var(ddof=1), rtol=1e-9)
 
 
 def test_a_sample_without_derivative_is_compared_with_none(key):

@@ -41,20 +41,17 @@ def assert_errors_are_right(estimates, num_repetitions: int) -> None:
     np.testing.assert_array_less(error, 0.1 * variance)
 
 
-@pytest.mark.parametrize(("baseline", "antithetic"), EVERY_WAY)
-def test_zeroth_order_knows_its_error_even_from_three_samples(baseline, antithetic):
-    times = 20_000
-    objective = parameter_noise(slanted, jnp.array([0.3, 0.5]))
-    estimates = repeat(
-        objective,
-        zeroth_order,
-        jnp.array([0.4, -0.7]),
-        times=times,
-        seed=1,
-        num_samples=6 if antithetic else 3,
-        baseline=baseline,
-        antithetic=antithetic,
-    )
+@pytest.mark.parametrize(
+    ("estimator", "settings"),
+    [
+        (first_order, {}),
+        *((zeroth_order, {"baseline": baseline, "antithetic": pairs}) for baseline, pairs in EVERY_WAY),
+    ],
+)
+def test_an_estimate_knows_its_error_even_from_three_samples(estimator, settings):
+    times, num_samples = 20_000, 6 if settings.get("antithetic") else 3
+    objective, point = parameter_noise(slanted, jnp.array([0.3, 0.5])), jnp.array([0.4, -0.7])
+    estimates = repeat(objective, estimator, point, times=times, seed=1, num_samples=num_samples, **settings)
     assert_errors_are_right(estimates, times)
 
 
@@ -68,14 +65,6 @@ def test_pairs_whose_scores_do_not_cancel_know_their_error():
     exact = np.array([3 + 8 * 0.4 - 0.7, -1 + 0.4])
     error = np.asarray(estimates.value).std(axis=0) / np.sqrt(times)
     np.testing.assert_array_less(np.abs(np.asarray(estimates.value).mean(axis=0) - exact), 4 * error)
-
-
-def test_first_order_knows_its_error_even_from_three_samples():
-    times = 20_000
-    objective = parameter_noise(slanted, jnp.array([0.3, 0.5]))
-    assert_errors_are_right(
-        repeat(objective, first_order, jnp.array([0.4, -0.7]), times=times, seed=3, num_samples=3), times
-    )
 
 
 def test_the_leave_one_out_baseline_halves_the_error_at_a_jump():

@@ -26,10 +26,7 @@ class Push(eqx.Module):
     profile: object
 
 
-FORMS = {
-    "dict": {"force": VECTOR[:2], "place": VECTOR[2]},
-    "module": Push(VECTOR[:2], VECTOR[2], jnp.tanh),
-}
+FORMS = {"dict": {"force": VECTOR[:2], "place": VECTOR[2]}, "module": Push(VECTOR[:2], VECTOR[2], jnp.tanh)}
 
 
 def leaves(tree):
@@ -79,8 +76,3 @@ def test_a_policy_gets_its_gradient_in_its_own_form(key):
         vector = compiled(objective, objective.ravel(policy), key, num_samples=8)
         assert tree.value["gain"].shape == (1, 2)
         np.testing.assert_allclose(objective.ravel(tree.value), vector.value, rtol=1e-12)
-
-
-def test_parameters_without_a_number_to_move_are_refused(key):
-    with pytest.raises(ValueError, match="params must have floating-point arrays"):
-        estimators.first_order(OBJECTIVE, {"force": 1}, key, num_samples=4)

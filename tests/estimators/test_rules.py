@@ -117,10 +117,3 @@ def test_bernsteins_bound_fails_at_most_as_often_as_it_says():
     # The inequality is for the true variance.
     error = rule.zeroth_error(Evidence(**(vars(facts) | {"zeroth_variance": jnp.array(0.09)})))
     assert (np.abs(samples.mean(axis=1) - 0.1) > float(error)).mean() <= 0.2
-
-
-def test_a_confidence_taken_for_a_failure_probability_is_answered():
-    with pytest.raises(ValueError, match=r"failure_probability must be above 0 and at most 0.2, got 0.95"):
-        rules.Consistent(failure_probability=0.95)
-    with pytest.raises(ValueError, match=r"failure_probability must be above 0 and at most 1.0, got 1.0"):
-        rules.BiasConstrained(1.0, bound=1.0, failure_probability=1.0)

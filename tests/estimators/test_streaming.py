@@ -1,11 +1,13 @@
 """Samples in chunks: memory, rounding, and honest counts of what was spent."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
+from mjxgrad import estimators
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import first_and_zeroth_order, first_order, zeroth_order
@@ -14,16 +16,11 @@ POINT = jnp.array([0.5, -1.2, 0.4])
 
 
 @pytest.fixture
-def key():
-    return jax.random.key(3)
-
-
-@pytest.fixture
 def objective():
     return parameter_noise(textbook.bumpy, jnp.array([0.1, 0.4, 0.2]))
 
 
-@pytest.mark.parametrize("chunk_size", [2, 7, 64, 1000])
+@pytest.mark.parametrize("chunk_size", [2, 64])
 @pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
 def test_the_size_of_chunks_changes_nothing_but_rounding(objective, key, chunk_size, baseline):
     settings = {"num_samples": 130, "baseline": baseline, "antithetic": True}
@@ -62,6 +59,7 @@ def test_sharing_rollouts_gives_what_each_estimator_gives_alone(objective, key):
         (first_order, {}, 40, 40),
         (zeroth_order, {"baseline": "zero_noise"}, 41, 0),
         (zeroth_order, {"antithetic": True}, 40, 0),
+        (eqx.filter_jit(estimators.alpha_order), {}, 40, 40),
         (lambda *a, **k: first_and_zeroth_order(*a, **k)[0], {"baseline": "zero_noise"}, 41, 41),
     ],
 )
@@ -97,24 +95,6 @@ def test_adding_a_large_constant_changes_nothing(offset):
     np.testing.assert_allclose(shifted.variance, plain.variance, rtol=1e-4)
 
 
-def test_the_noise_of_a_sample_does_not_depend_on_the_number_of_samples(key):
-    """So a longer run contains the shorter one."""
-    seen = {}
-    for num_samples in (4, 9):
-        rows = []
-        objective = parameter_noise(lambda x, rows=rows: _remember(x, rows), 0.1)
-        jax.block_until_ready(first_order(objective, jnp.array([0.0]), key, num_samples=num_samples).value)
-        jax.effects_barrier()
-        seen[num_samples] = set(rows)
-    assert len(seen[4]) == 4
-    assert seen[4] < seen[9]
-
-
-def _remember(x, rows):
-    jax.debug.callback(lambda value: rows.append(float(value[0])), x)
-    return x[0]
-
-
 def test_a_function_with_a_rule_for_reverse_mode_only_is_differentiated_by_it(key):
     """Few parameters are differentiated in forward mode, which such a function does not have."""
 
@@ -130,7 +110,7 @@ def test_a_function_with_a_rule_for_reverse_mode_only_is_differentiated_by_it(ke
 @pytest.mark.parametrize("antithetic", [False, True])
 @pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
 def test_each_baseline_is_what_it_is_called(key, baseline, antithetic):
-    """The formula, term by term, from the same noise: g = mean of (f - b) s."""
+    """The formula, term by term, from the same noise, which each sample has by its number: g = mean of (f - b) s."""
     point, units = 0.3, 10 // (1 + antithetic)
     objective = parameter_noise(textbook.quadratic_sine, 0.1, dim=1)
     noise = np.array([objective.sample_noise(jax.random.fold_in(key, i))[0] for i in range(units)])

@@ -73,10 +73,7 @@ def test_an_array_that_is_too_short_for_its_own_mistakes_alone_is_not_called_so(
     ("override", "sentence"),
     [
         ("experiment=bias_varianc", 'experiment: there is no experiment "bias_varianc"; did you mean "bias_variance"?'),
-        (
-            "experiment=surfing",
-            'experiment: there is no experiment "surfing"; choose one of bias_variance, ',
-        ),
+        ("experiment=surfing", 'experiment: there is no experiment "surfing"; choose one of bias_variance, '),
         ("task=ball_wal", 'task: there is no "ball_wal"; did you mean "ball_wall"?'),
         ("task=juggling", 'task: there is no "juggling"; choose one of ball_wall, ramp'),
         ("seed=1.5", "seed: must be integer, got 1.5"),

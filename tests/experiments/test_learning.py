@@ -7,9 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from experiments import learning
 from experiments.__main__ import main
-from experiments.config import ExperimentError, load_runs
+from experiments.config import ExperimentError
 from experiments.learning import Course, Outcome, Settings, Sizes, findings, measure, verdict
 from experiments.workspace import Workspace
 
@@ -63,16 +62,6 @@ def test_a_reward_that_falls_again_is_not_the_soonest():
     rewards = {"onset": [0, 2, 0, 0], "zeroth": [0, 3, -6, 0]}
     courses = [course(name, [[1, 1]] * 2, reward=np.repeat([r], 2, axis=0).T) for name, r in rewards.items()]
     assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["onset"]
-
-
-def test_the_trot_is_learned_as_published_but_for_the_rate():
-    """MuJoCo's notebook: 64 windows of 32; five times brax's rate, its decay, and no discount."""
-    (published,) = load_runs("learn_trot", ['size="full"'])
-    how = learning._how(published.settings, "onset")
-    assert (how.num_environments, how.window, how.actor_layers) == (64, 32, (256, 128))
-    assert (how.actor_rate, how.actor_decay, how.discount, how.has_critic) == (5e-4, 0.997, 1.0, False)
-    (faster,) = load_runs("learn_trot", ["actor_rate=1e-3"])
-    assert learning._how(faster.settings, "onset").actor_rate == 1e-3
 
 
 COMMAND = ["run", "learn_cartpole", 'size="quick"', "sizes.num_updates=2", 'methods=["onset"]', "precision=float64"]

@@ -69,14 +69,6 @@ def test_a_second_run_into_a_folder_is_refused_by_the_number_of_the_first_and_le
     assert listing(tmp_path) == [".run.partial-old", "run"]
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path):
-    """A path below a file: no user may write there, root neither."""
-    (tmp_path / "file").write_text("")
-    sentence = r"cannot write the results to .*file/run: not a directory.*--output"
-    with pytest.raises(ExperimentError, match=sentence), building(tmp_path / "file" / "run"):
-        pass
-
-
 def test_settings_survive_their_way_through_toml(tmp_path):
     settings = {
         "text": 'a "quoted" \\ word', "number": 1e-05, "large": 1e16, "count": 3, "flag": True, "none": None,

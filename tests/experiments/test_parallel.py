@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from experiments.parallel import in_threads, num_compilers, num_cores
+from experiments.parallel import in_threads, num_compilers
 
 
 def test_results_keep_the_order_of_the_items():
@@ -32,7 +32,3 @@ def test_the_first_mistake_is_raised():
 
     with pytest.raises(ValueError, match="no such scene"):
         in_threads(work, range(4))
-
-
-def test_there_are_no_more_compilers_than_cores():
-    assert 1 <= num_compilers() <= num_cores()

@@ -135,18 +135,8 @@ def test_the_table_tells_what_alpha_order_makes_of_both():
 
 
 def test_every_task_gets_its_figure(tmp_path):
-    rng = np.random.default_rng(0)
-
-    def named(name, dim, point="start"):
-        def estimates():
-            parts = rng.normal(size=(2, 8, dim))
-            return Estimated(*parts, rng.uniform(size=8), np.full(8, TRUSTED), np.zeros(8))
-
-        both = {"discrete": estimates(), "onset": estimates()}
-        return Cell(name, "Task", point, False, False, both, 1 + rng.normal(size=(8, dim)))
-
-    throws = [named("ball_wall", 1, f"{angle} rad") for angle in (0.4, 0.5)]
-    one = outcome(*throws, named("hopper", 21))
+    throws = [cell([3.0, 0.0], [0.0, 0.0], name="ball_wall", point=f"{angle} rad") for angle in (0.4, 0.5)]
+    one = outcome(*throws, cell([3.0, 0.0], [0.0, 0.0]))
     figures = save(drawings(one), one, tmp_path)
     assert [figure.file for figure in figures] == [f"figures/{name}.svg" for name in ("summary", "throw")]
     assert len(one.rows()) == 2 * 3

@@ -30,12 +30,8 @@ from experiments.real_tosses import (
 )
 from mjxgrad.identification.parameters import write_all
 
-START, VELOCITY, SPIN, GRAVITY = (
-    np.array([0.3, -0.2, 0.5]),
-    np.array([1.0, -0.5, 0.8]),
-    np.array([3.0, -2.0, 5.0]),
-    9.81,
-)
+START, VELOCITY, SPIN = np.array([[0.3, -0.2, 0.5], [1.0, -0.5, 0.8], [3.0, -2.0, 5.0]])
+GRAVITY = 9.81
 
 
 def save(path, rows):

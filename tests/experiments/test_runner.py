@@ -34,50 +34,6 @@ reference_samples = 500
 """
 
 
-# A whole kind; `warnings` is a module here, and no sentence of the report.
-ONE_FILE = """\
-import warnings
-from dataclasses import dataclass
-
-import jax.numpy as jnp
-
-from experiments.report import Table
-from experiments.settings import RunSettings
-
-
-class Settings(RunSettings):
-    number: float
-
-
-@dataclass
-class Outcome:
-    double: float
-
-    def rows(self):
-        return [{"double": self.double}]
-
-
-def measure(settings, workspace):
-    return Outcome(float(2 * jnp.asarray(settings.number)))
-
-
-def answer(outcome):
-    return f"It is {outcome.double}."
-
-
-def verdict(outcome):
-    return f"Twice the number is {outcome.double}."
-
-
-def tables(outcome):
-    return [Table(["double"], [[str(outcome.double)]], "All.")]
-
-
-def drawings(outcome):
-    return {}
-"""
-
-
 def run(path, folder, *arguments):
     return main(["run", str(path), "--output", str(folder), *arguments])
 
@@ -167,7 +123,7 @@ def test_an_unchanged_run_says_so_and_where_its_report_is(copied, capsys):
     assert (copied / "runs" / "steep" / "environment.json").read_text() == before
 
 
-def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch):
+def test_a_change_of_settings_or_source_or_force_or_a_damaged_record_runs_again(copied, monkeypatch):
     """A run that is reached raises here, and leaves the former result."""
     _raise(monkeypatch, ValueError("reached"))
     assert run(copied / "steep.toml", copied / "runs") == 0
@@ -176,6 +132,13 @@ def test_a_change_of_settings_or_source_or_force_runs_again(copied, monkeypatch)
     (copied / "runs" / "steep" / "report.html").rename(copied / "gone.html")
     assert run(copied / "steep.toml", copied / "runs") == 2
     (copied / "gone.html").rename(copied / "runs" / "steep" / "report.html")
+    record = copied / "runs" / "steep" / "environment.json"
+    told = record.read_text()
+    for damaged in ("[]", "{", '{"fingerprint": 1}'):
+        record.write_text(damaged)
+        assert run(copied / "steep.toml", copied / "runs") == 2
+    record.write_text(told)
+    assert run(copied / "steep.toml", copied / "runs") == 0
     monkeypatch.setattr(runner, "ROOT", copied)
     assert run(copied / "steep.toml", copied / "runs") == 2
     assert (copied / "runs" / "steep" / "metrics.csv").is_file()
@@ -291,44 +254,56 @@ def test_a_choice_of_opengl_that_mujoco_does_not_know_is_a_sentence(tmp_path):
     assert result.stderr.endswith('MUJOCO_GL: bogus; unset it, or take "egl", "osmesa" or "glfw"\n')
 
 
-@pytest.mark.parametrize("damage", ["[]", "{", '{"fingerprint": 1}'])
-def test_a_damaged_record_of_a_run_is_none(copied, monkeypatch, damage):
-    (copied / "runs" / "steep" / "environment.json").write_text(damage)
-    _raise(monkeypatch, ValueError("reached"))
-    assert run(copied / "steep.toml", copied / "runs") == 2
-
-
-# A kind of two parts that kills itself in the second one, once.
+# A whole kind, of two parts, that kills itself in the second one, once; `warnings` is a module here, and no sentence.
 IN_PARTS = """
 import os
 import signal
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
+
+import jax.numpy as jnp
+
+from experiments.report import Table
+from experiments.settings import RunSettings
 
 LOG = Path(__file__).with_name("log")
 
 
-def part(number):
-    with LOG.open("a") as file:
-        file.write(f"{number} ")
-    warnings.warn(f"part {number}")
-    if LOG.read_text() == "0 1 ":
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number + jnp.asarray(settings_number)
+class Settings(RunSettings):
+    number: float
+
+
+@dataclass
+class Outcome:
+    double: float
+
+    def rows(self):
+        return [{"double": self.double}]
 
 
 def measure(settings, workspace):
-    global settings_number
-    settings_number = settings.number
+    def part(number):
+        with LOG.open("a") as file:
+            file.write(f"{number} ")
+        warnings.warn(f"part {number}")
+        if LOG.read_text() == "0 1 ":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number + jnp.asarray(settings.number)
+
     found = [workspace.once(f"part/{number}", lambda number=number: part(number)) for number in range(2)]
     return Outcome(float(sum(found)))
+
+
+answer = verdict = lambda outcome: f"Twice the number is {outcome.double}."
+tables = lambda outcome: [Table(["double"], [[str(outcome.double)]], "All.")]
+drawings = lambda outcome: {}
 """
 
 
 def test_after_a_kill_a_run_goes_on_from_its_last_finished_part(tmp_path, monkeypatch, capsys):
     """0.1 + 1.1 by a process that is killed in the second part, and one that follows."""
-    head, _, tail = ONE_FILE.partition("def measure(")
-    (tmp_path / "in_parts.py").write_text(head + IN_PARTS + tail[tail.index("\n\n\n") :])
+    (tmp_path / "in_parts.py").write_text(IN_PARTS)
     (tmp_path / "trial.toml").write_text('# How much?\nexperiment = "in_parts"\nnumber = 0.1\n')
     begin = (
         "import sys, pathlib, experiments, experiments.__main__ as command; from experiments import config; "

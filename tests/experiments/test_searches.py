@@ -9,15 +9,8 @@ import pytest
 
 import mjxgrad as mg
 from experiments.optimisation.searches import mppi, predictive_sampling
+from tests.test_baselines import START, bowl, objective
 
-START = jnp.array([0.0, 0.5])
-
-
-def bowl(x):
-    return ((x - jnp.array([1.0, -2.0])) ** 2 * jnp.array([0.5, 1.5])).sum()
-
-
-objective = mg.parameter_noise(bowl, 0.3, dim=2)
 METHODS = {"mppi": mppi, "predictive_sampling": predictive_sampling}
 
 

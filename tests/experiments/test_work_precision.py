@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 import mjxgrad as mg
 from experiments.__main__ import main
-from experiments.config import ConfigurationError, load_runs
+from experiments.config import load_runs
 from experiments.theme import save
 from experiments.work_precision import report
 from experiments.work_precision.cases import case
@@ -152,11 +152,6 @@ def test_every_time_step_divides_every_motion(size):
         for refinement in (*sizes.refinements, *sizes.gradient_refinements):
             steps = one.duration * refinement / one.model.opt.timestep
             assert steps == pytest.approx(round(steps), abs=1e-9), (name, refinement)
-
-
-def test_settings_that_cannot_be_are_a_sentence():
-    with pytest.raises(ConfigurationError, match="precision must be float64"):
-        load_runs("work_precision", ['precision="float32"'])
 
 
 @pytest.mark.slow

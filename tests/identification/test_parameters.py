@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
@@ -70,15 +69,6 @@ def test_makers_write_what_they_say(scene):
     np.testing.assert_allclose(parameters.stiffness, present.stiffness)
 
 
-def test_what_follows_from_a_mass_follows_as_when_recompiled(scene):
-    """The inverse weights of contact rows, against MuJoCo's own compiler."""
-    mass = identification.mass(scene, "ball")
-    found = write_all(scene, {"mass": mass}, {"mass": jnp.asarray(5.0)}).model
-    recompiled = mujoco.MjModel.from_xml_string(_SCENE.replace('mass="2"', 'mass="5"'))
-    for name in ("body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0"):
-        np.testing.assert_allclose(getattr(found, name), getattr(recompiled, name), rtol=1e-9, err_msg=name)
-
-
 def _random_body(seed):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(12, 3)) * [0.1, 0.2, 0.3] + [0.05, -0.1, 0.2]
@@ -111,7 +101,7 @@ def test_the_derivative_by_ten_numbers_is_that_of_the_tensor(body):
         offset = jnp.append(fields["body_ipos"], 1.0)
         return fields["body_mass"] * jnp.outer(offset, offset) + jnp.pad(about, (0, 1))
 
-    found, expected = (jax.jacfwd(f)(jnp.asarray(start)) for f in (there_and_back, pseudo_inertia))
+    found, expected = (jax.jit(jax.jacfwd(f))(jnp.asarray(start)) for f in (there_and_back, pseudo_inertia))
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
@@ -123,26 +113,3 @@ def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
         np.testing.assert_allclose(
             getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name
         )
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda scene: Parameter(3.0, 0.0, 1.0), "lower, nominal and upper must increase"),
-        (lambda scene: Parameter([1.0, 2.0], [0.0, 0.0, 0.0]), "lower must be one number or of shape"),
-        (lambda scene: Parameter(np.nan), "nominal must be finite"),
-        (lambda scene: identification.armature(scene, "slide"), "bounds of armature must be given"),
-        (
-            lambda scene: identification.mass(scene, "leg"),
-            "there is no body 'leg'; named bodies are 'world', 'arm', 'ball'",
-        ),
-        (
-            lambda scene: identification.softness(scene, "hardness"),
-            "part must be one of stiffness, damping_ratio, width",
-        ),
-        (lambda scene: Coordinates.of({}), "parameters must name at least one"),
-    ],
-)
-def test_refusals_name_the_remedy(scene, build, message):
-    with pytest.raises(ValueError, match=message):
-        build(scene)

@@ -95,33 +95,30 @@ def test_an_interruption_in_the_middle_of_a_save_loses_nothing(cartpole, key, tm
     assert told == [2]
 
 
-class Cornered(CartPole):
-    """Its reward has an infinite slope where the action is zero, which the first window's first environment begins with."""
+class Spoiled(CartPole):
+    """Its reward has an infinite slope where the cart is to the right, or, where so much is lost, is no number at all."""
+
+    lost: jax.Array = eqx.field(kw_only=True)
 
     def rewards(self, before, action, after, memory):
         terms = super().rewards(before, action, after, memory)
-        return {**terms, "corner": jnp.sqrt(jnp.where(after.qpos[0] > 0, 0.0 * action[0], 1.0))}
+        corner = jnp.sqrt(jnp.where(after.qpos[0] > 0, 0.0 * action[0], 1.0))
+        return {**terms, "corner": corner + self.lost * after.qpos[0]}
 
 
 def test_derivatives_that_are_no_numbers_are_counted_and_replaced(cartpole, key):
     """Where the cart is to the right the derivative of √0 makes NaN of that window's, up to there."""
-    cornered = Cornered(cartpole.scene, frame_skip=2)
+    cornered = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.zeros(()))
     run = learning.learn(cornered, key, num_updates=1, log_every=1, settings=SMALL)
     assert 0 < run.history["not_finite"][0] < 1
     assert run.history["skipped"][0] == 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(run.policy.actor))
 
 
-class Lost(CartPole):
-    """A reward that is no number."""
-
-    def rewards(self, before, action, after, memory):
-        return {"lost": after.qpos[0] * jnp.nan}
-
-
 def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
-    start = ActorCritic(Lost(cartpole.scene), SMALL, 1).init(key)
-    run = learning.learn(Lost(cartpole.scene), key, num_updates=1, settings=SMALL)
+    lost = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.array(jnp.nan))
+    start = ActorCritic(lost, SMALL, 1).init(key)
+    run = learning.learn(lost, key, num_updates=1, log_every=1, settings=SMALL)
     assert run.history["skipped"][0] == 1
     # Up to rounding, since the start is compiled on its own there; one step of Adam would be 2e-3.
     jax.tree.map(lambda x, y: assert_allclose(x, y, atol=1e-12), run.policy.actor, start.policy.actor)
@@ -219,20 +216,6 @@ def test_the_rate_falls_to_zero_or_by_a_share(decay, rates):
         assert_allclose(change, [-rate], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"window": 0}, "window must be at least 1, got 0"),
-        ({"discount": 1.5}, "discount must be from 0 to 1, got 1.5"),
-        ({"stddev": (0.1, 0.0)}, "stddev must be positive"),
-        ({"critic_batches": 5}, "critic_batches must divide the 2048 states of an update, got 5"),
-    ],
-)
-def test_settings_out_of_range_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        learning.Settings(**change)
-
-
 _PROGRAM = """
     import sys
 
@@ -289,14 +272,6 @@ def test_seeds_and_environments_side_by_side_learn_as_each_alone(cartpole, key):
         assert_allclose(all_of_them[2, 1], mine, rtol=1e-8, atol=1e-10)
         assert_allclose(all_of_them[0], all_of_them[1], rtol=1e-8, atol=1e-10)
     assert not np.allclose(together.history["reward"][:, 0], together.history["reward"][:, 2], rtol=1e-3)
-
-
-def test_environments_that_differ_in_more_than_numbers_are_refused(cartpole, key):
-    other = dataclasses.replace(cartpole, frame_skip=3)
-    with pytest.raises(ValueError, match="must differ in numbers alone"):
-        learning.learn([cartpole, other], key, num_updates=1, settings=SMALL)
-    with pytest.raises(ValueError, match="one or several, got an empty sequence"):
-        learning.learn([], key, num_updates=1)
 
 
 def test_environments_share_all_numbers_but_those_that_differ(cartpole):

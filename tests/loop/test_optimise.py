@@ -172,39 +172,6 @@ def test_the_optimiser_is_told_the_cost(key):
     np.testing.assert_allclose(falling.history.step_norm, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"num_steps": 0}, "num_steps must be at least 1, got 0"),
-        ({"evaluate_every": 0}, "evaluate_every must be at least 1, got 0"),
-        ({"annealing": optax.constant_schedule(1.0)}, "objective must be a function from a scale"),
-        ({"checkpoint": "/nowhere/at/all.npz"}, "checkpoint must be in a folder that exists"),
-    ],
-)
-def test_settings_without_meaning_are_refused(key, settings, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        run(key, **settings)
-
-
-@pytest.mark.parametrize(
-    ("params", "num_keys", "sentence"),
-    [
-        (jnp.zeros((3, 2)), None, "params must have a leading axis only where key has the same"),
-        (jnp.zeros((3, 2)), 4, "params must have a leading axis only where key has the same"),
-        (jnp.zeros(()), None, "params must be a vector of shape"),
-    ],
-)
-def test_starts_that_do_not_fit_are_refused(key, params, num_keys, sentence):
-    key = key if num_keys is None else jax.random.split(key, num_keys)
-    with pytest.raises(ValueError, match=sentence):
-        mg.optimise(problems.objective, params, key, estimator=problems.exact, optimiser=SGD, num_steps=1)
-
-
-def test_a_function_that_is_no_objective_is_refused(key):
-    with pytest.raises(ValueError, match="objective must be an Objective, got function; wrap a function by"):
-        mg.optimise(problems.bowl, START, key, estimator=problems.exact, optimiser=SGD, num_steps=1)
-
-
 def test_a_run_of_the_same_program_compiles_nothing_and_what_functions_read_is_read_again(key, compilations):
     """Everything is made anew: the cost, its noise, the estimator and the optimiser. A target that has changed counts."""
     target = {"place": 1.0}

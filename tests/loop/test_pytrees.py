@@ -8,7 +8,6 @@ import optax
 import pytest
 
 import mjxgrad as mg
-from tests.estimators import textbook
 from tests.loop import problems
 
 
@@ -76,32 +75,3 @@ def test_a_transformation_takes_and_gives_the_form(key, form):
         change, state = transformation.update(None, state, params)
         params = eqx.apply_updates(params, change)
     np.testing.assert_allclose(back(params), result.params, rtol=1e-12)
-
-
-def test_a_run_is_resumed(key, form, tmp_path):
-    there, back, cost = form
-    options = {"num_steps": 2, "evaluate": cost, **SETTINGS}
-    objective = mg.parameter_noise(cost, 0.1)
-    whole = mg.optimise(objective, there(START), key, **options)
-    path = tmp_path / "run.npz"
-
-    def kill(*_):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        mg.optimise(objective, there(START), key, checkpoint=path, log=kill, **options)
-    steps = []
-    options["log"] = lambda step, _: steps.append(step)
-    resumed = mg.optimise(objective, there(START), key, checkpoint=path, **options)
-    assert steps == [2]
-    np.testing.assert_array_equal(back(resumed.params), back(whole.params))
-
-
-def test_a_policy_comes_back_in_its_own_form(key):
-    """The objective has a way of its own from the vector to the policy's parameters; both agree."""
-    policy = {"gain": jnp.array([[0.3, -0.2]]), "offset": jnp.array([0.1])}
-    objective = mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, 0.1, params=policy)
-    result = mg.optimise(objective, policy, key, num_steps=3, **SETTINGS)
-    vector = mg.optimise(objective, objective.ravel(policy), key, num_steps=3, **SETTINGS)
-    assert result.params["gain"].shape == (1, 2)
-    np.testing.assert_array_equal(objective.ravel(result.params), vector.params)

@@ -9,6 +9,7 @@ import optax
 import pytest
 
 import mjxgrad as mg
+from tests.estimators.test_nothing_felt import dead_zone
 from tests.loop import problems
 from tests.loop.problems import made_up
 
@@ -45,30 +46,15 @@ def test_a_log_of_many_seeds_has_the_mean_of_those_that_took_the_step(key):
     assert told[4]["cost"] == pytest.approx(result.history.cost[0, 3])
 
 
-def dead_zone(x):
-    """Nothing within 1 of zero, then a slope: a finger that does not reach the ball."""
-    return 5.0 + jnp.maximum(jnp.abs(x) - 1, 0.0).sum()
-
-
-@pytest.mark.parametrize("name", ["first_order", "zeroth_order", "alpha_order", "control_variate"])
-def test_a_run_that_feels_nothing_stops_at_once_and_says_so(key, name):
-    estimator = functools.partial(getattr(mg.estimators, name), num_samples=8)
+def test_a_run_that_feels_nothing_stops_at_once_and_says_so(key):
+    """As a finger that does not reach the ball."""
+    estimator = functools.partial(mg.estimators.alpha_order, num_samples=8)
     settings = {"estimator": estimator, "optimiser": optax.adam(0.1), "num_steps": 60}
     result = mg.optimise(mg.parameter_noise(dead_zone, 0.1), START, key, **settings)
     assert result.stopped == mg.Stopped.nothing_felt
     assert "nothing that the parameters change reaches the cost" in mg.Stopped[result.stopped]
     assert result.num_steps == 3
     np.testing.assert_array_equal(result.params, START)
-
-
-def test_one_seed_that_feels_nothing_stops_without_the_others(key):
-    starts = jnp.array([[0.0, 0.5], [2.0, 2.0]])
-    result = mg.optimise(
-        mg.parameter_noise(dead_zone, 0.1), starts, jax.random.split(key, 2),
-        estimator=problems.first_order, optimiser=optax.sgd(0.01), num_steps=10,
-    )  # fmt: skip
-    assert list(result.stopped == mg.Stopped.nothing_felt) == [True, False]
-    assert list(result.num_steps) == [3, 10]
 
 
 def test_momentum_has_the_patience_of_the_run_to_leave_a_zone_where_nothing_is_felt(key):
@@ -131,15 +117,3 @@ def test_one_seed_stops_without_the_others(seeds):
     assert list(together.stopped == mg.Stopped.not_finite) == [False, False, True]
     assert list(together.stopped == mg.Stopped.finished) == [True, True, False]
     assert np.isnan(together.history.cost[2, 3:]).all()
-
-
-def test_seeds_draw_different_noise(key):
-    result = mg.optimise(
-        problems.objective,
-        START,
-        jax.random.split(key, 3),
-        estimator=problems.noisy,
-        optimiser=optax.sgd(0.1),
-        num_steps=2,
-    )
-    assert len(np.unique(result.params[:, 0])) == 3

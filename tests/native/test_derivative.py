@@ -1,6 +1,5 @@
 """Derivatives through C MuJoCo: those of its steps are `mjd_transitionFD`'s, and rollouts are differentiable both ways."""
 
-import copy
 import dataclasses
 
 import jax
@@ -201,7 +200,6 @@ def test_a_model_that_is_differentiated_is_left_as_it_was(pushed):
     before = end(at)
     jax.grad(end)(at)
     assert end(at) == before
-    assert copy.deepcopy(at).keys() == at.keys()
 
 
 @pytest.mark.parametrize(("gradient", "geom"), [("discrete", "box"), ("slope", "sphere")])
@@ -253,7 +251,8 @@ def test_growth_is_that_of_the_other_engine_and_has_no_derivative():
         course = mg.rollout(scene, mg.initial_state(scene), controls, contact=mg.Discrete(engine), measure_growth=True)
         return course.qpos[-1, 0], (course.growth, course.explodes)
 
-    (by_c, by_mjx) = (jax.value_and_grad(swung, has_aux=True)(0.1, engine) for engine in ("mujoco", "mjx"))
+    differentiated = jax.jit(jax.value_and_grad(swung, has_aux=True), static_argnums=1)
+    by_c, by_mjx = (differentiated(0.1, engine) for engine in ("mujoco", "mjx"))
     np.testing.assert_allclose(by_c[0][1], by_mjx[0][1], rtol=1e-6)  # differences of 1e-6
     np.testing.assert_allclose(by_c[1], by_mjx[1], rtol=1e-6)
     assert not by_c[0][1][1]

@@ -1,9 +1,6 @@
 """The slope of C MuJoCo's outcome: closed forms, secants of the outcome, and what events are."""
 
-from pathlib import Path
-
 import equinox as eqx
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -14,6 +11,7 @@ import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.native.engine import Engine
 from mjxgrad.native.events import Surfaces, _moved_apart, levers_of
+from tests.scenes import ASSETS
 
 BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
     <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
@@ -41,6 +39,10 @@ def _compared(scene, index, interval, horizon, speeds, count=96, read=3):
         course = mg.rollout(scene, start, horizon=horizon, contact=mg.Slope("mujoco"))
         return course.qpos[jnp.array([horizon // 2, horizon]), :read]
 
+    return _to_slope(outcome, interval, count)
+
+
+def _to_slope(outcome, interval, count):
     parameters = phases(interval, count)
     outcomes, derivatives = jax.jit(jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,))))(jnp.asarray(parameters))
     return compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
@@ -195,8 +197,7 @@ def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
 
 def test_a_hopper_that_lands_on_its_limits_has_its_slope():
     """gymnasium's, by Euler steps: what moves its foot would carry knee and hip off their limits, were they not held."""
-    file = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
-    model = mujoco.MjModel.from_xml_path(str(file))
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "hopper.xml"))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     scene = mg.load_scene(model)
     scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.full(3, 0.1))  # motors press into the limits
@@ -226,9 +227,7 @@ def test_a_cylinder_that_stands_on_a_box_has_the_slope_as_mean():
         start = mg.initial_state(scene, qvel=jnp.array([0.05, 0.02 + place, 0, 0.03, 0.02, 0.01]))
         return mg.rollout(scene, start, horizon=60, contact=mg.Slope()).qpos[-1, :2]
 
-    parameters = phases((-0.1, 0.1), 65)
-    outcomes, derivatives = jax.jit(jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,))))(jnp.asarray(parameters))
-    found = compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
+    found = _to_slope(outcome, (-0.1, 0.1), 65)
     assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope))
     assert np.all(found.spread[0] < 0.1 * np.abs(found.slope).max())
 
@@ -247,9 +246,7 @@ def test_a_cloth_that_lands_has_the_slope_as_mean():
         start = mg.initial_state(scene, qvel=speeds.at[2::3].add(place))
         return mg.rollout(scene, start, horizon=60, contact=mg.Slope()).qpos[-1, jnp.array([0, 2])]
 
-    parameters = phases((-0.3, 0.3), 65)
-    outcomes, derivatives = jax.jit(jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,))))(jnp.asarray(parameters))
-    found = compare_to_slope(parameters, np.asarray(outcomes), [np.asarray(derivatives)], ("slope",))
+    found = _to_slope(outcome, (-0.3, 0.3), 65)
     assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope))
     assert np.all(found.mean_error[0] < 0.2 * np.abs(found.slope).max())
 

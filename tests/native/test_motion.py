@@ -68,29 +68,6 @@ def test_a_rollout_that_diverges_stays_at_its_last_good_state(scene):
     np.testing.assert_array_equal(trajectory.qpos[8:], np.tile(trajectory.qpos[7], (HORIZON - 7, 1)))
 
 
-def test_zeroth_order_is_the_same_by_either_engine(scene):
-    task = mg.SceneTask(scene, mg.initial_state(scene), lambda trajectory: (trajectory.qpos[-1] ** 2).sum(), HORIZON)
-    controls = jnp.zeros(HORIZON * scene.model.nu)
-    costs = [
-        mg.estimators.zeroth_order(
-            mg.open_loop(task.with_contact(mg.Discrete(engine)), 0.1), controls, jax.random.key(0), num_samples=4
-        )
-        for engine in ("mjx", "mujoco")
-    ]
-    np.testing.assert_allclose(costs[1].value, costs[0].value, atol=1e-6 * np.abs(costs[0].value).max())
-
-
-def test_observations_are_refused(scene):
-    how = {"horizon": 2, "contact": mg.Discrete("mujoco"), "observe": lambda model, data: data.qpos}
-    with pytest.raises(ValueError, match="observe must be left out where C MuJoCo steps"):
-        _rollout(scene, jnp.zeros(scene.model.nv), None, **how)
-
-
-def test_an_engine_that_is_none_is_refused():
-    with pytest.raises(ValueError, match='engine must be "mjx", "mujoco" or None, got \'warp\''):
-        mg.Discrete("warp")
-
-
 def test_a_policy_is_asked_before_each_step(scene):
     """The controls that it gave, given as numbers, make the same motion."""
 
@@ -126,13 +103,6 @@ def test_what_is_given_to_each_step_acts_alike_in_both_engines():
     np.testing.assert_allclose(theirs, ours, atol=1e-7)  # what the solves leave, and contacts multiply
     still = mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, contact=mg.Discrete("mujoco")).qpos
     assert np.abs(still - theirs).max() > 1e-2
-
-
-def test_wrong_inputs_are_refused(scene):
-    with pytest.raises(ValueError, match=r"inputs must be among qfrc_applied, .* got 'ctrl'"):
-        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"ctrl": np.zeros((2, 2))})
-    with pytest.raises(ValueError, match=r"inputs\['qfrc_applied'\] must have shape \(2, \d\), one row per step"):
-        _rollout(scene, jnp.zeros(scene.model.nv), None, horizon=2, inputs={"qfrc_applied": np.zeros(3)})
 
 
 def test_softness_acts_on_a_scene_that_mjx_lacks():

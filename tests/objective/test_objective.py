@@ -87,12 +87,6 @@ def test_noise_has_the_standard_deviation_it_is_given():
     np.testing.assert_allclose(noise.std(axis=0), [0.1, 1.0, 20.0], rtol=4 / np.sqrt(2 * 4000))
 
 
-def test_zero_noise_changes_nothing():
-    objective = parameter_noise(textbook.bumpy, STDDEV, dim=3)
-    params = jnp.array([0.2, 0.5, -0.1])
-    assert objective.value(params, objective.zero_noise()) == textbook.bumpy(params)
-
-
 def test_single_precision_stays_single():
     """Noise of double precision does not turn a single-precision scene's parameters into double."""
     objective = parameter_noise(lambda x: x.sum(), STDDEV, dim=2)
@@ -100,11 +94,6 @@ def test_single_precision_stays_single():
     noise = objective.sample_noise(jax.random.key(0))
     assert objective.value(params, noise).dtype == jnp.float32
     assert objective.score(params, noise).dtype == jnp.float32
-
-
-def test_noise_of_an_unknown_dimension_is_refused_by_name():
-    with pytest.raises(ValueError, match="dim is not known: pass dim"):
-        parameter_noise(textbook.bumpy, STDDEV).sample_noise(jax.random.key(0))
 
 
 class Laplace(Objective):
@@ -138,8 +127,8 @@ def objectives():
 def test_pulled_back_the_derivative_by_noise_is_the_first_order_gradient_and_the_score_the_score(name, key):
     objective, params = objectives()[name]
     noise = objective.sample_noise(key)
-    found = objective.differentiate(params, noise)
-    gradient = jax.grad(objective.value)(params, noise)
+    found = eqx.filter_jit(objective.differentiate)(params, noise)
+    gradient = jax.jit(jax.grad(objective.value))(params, noise)
     np.testing.assert_allclose(found.cost, objective.value(params, noise), rtol=1e-14)
     # The same sum of the same terms in another order.
     np.testing.assert_allclose(found.pull_back(found.gradient_by_noise), gradient, rtol=1e-12)

@@ -34,11 +34,6 @@ def test_mirrored_and_redrawn_noise_begins_at_the_same_place(objective, key):
     assert np.abs(other - noise).min() > 0
 
 
-def test_only_a_random_start_is_a_circumstance_beside_the_noise(objective):
-    assert objective.has_circumstances
-    assert not open_loop(textbook.LinearSystem(), STDDEV).has_circumstances
-
-
 def test_zero_noise_takes_the_nominal_start(objective, params):
     fixed = eqx.tree_at(lambda o: o.task, objective, textbook.LinearSystem())
     assert objective.value(params, objective.zero_noise()) == fixed.value(params, fixed.zero_noise())

@@ -148,25 +148,6 @@ def test_without_noise_on_a_coordinate_least_squares_gives_zero(key):
     assert not model.A[:, 1].any()
 
 
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"stddev_state": -1.0}, "stddev_state must be at least 0"),
-        ({"stddev_control": jnp.ones(3)}, "stddev_control must be a number or have shape"),
-        ({"num_samples": 4}, "num_samples must be at least 5"),
-    ],
-)
-def test_what_cannot_be_is_refused_in_a_sentence(key, settings, sentence):
-    settings = {"stddev_state": 0.1, "stddev_control": 0.1, "num_samples": 10} | settings
-    with pytest.raises(ValueError, match=sentence):
-        zeroth_order(FunctionSystem(affine, 2, 1), jnp.zeros(2), CONTROL, key, **settings)
-
-
-def test_a_system_without_contacts_refuses_analytic_smoothing():
-    with pytest.raises(ValueError, match="analytic smoothing must be of a SceneSystem, got FunctionSystem"):
-        FunctionSystem(affine, 2, 1).with_contact(Smoothing(0.1))
-
-
 SPRING = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body>
   <joint name="x" type="slide" axis="1 0 0" stiffness="3" damping="0.4"/><geom size="0.1" mass="0.5"/></body></worldbody>
   <actuator><motor joint="x"/></actuator></mujoco>"""
@@ -194,12 +175,6 @@ def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
         np.testing.assert_allclose(model.A, one_a @ one_a, atol=1e-10)
         np.testing.assert_allclose(model.B, one_a @ one_b + one_b, atol=1e-10)
         np.testing.assert_allclose(model.c, model.A @ at + (model.B @ control), atol=1e-10)
-
-
-def test_a_step_can_be_jitted_as_it_is():
-    system = SceneSystem(mg.load_scene(SPRING))
-    at, control = jnp.array([0.1, -0.3]), jnp.array([0.7])
-    np.testing.assert_allclose(jax.jit(system.step)(at, control), system.step(at, control), rtol=1e-12)
 
 
 def test_limits_are_those_of_the_actuators_unless_others_are_given():

@@ -181,22 +181,6 @@ def test_a_plan_is_the_rollout_of_its_controls(pushing):
         np.testing.assert_allclose(state, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"schedule": np.zeros(0)}, "schedule must be one factor per iteration"),
-        ({"schedule": np.array([1.0, 0.0])}, r"schedule must be positive, got 0: for no smoothing take Exact\(\)"),
-        ({"lower": 1.0, "upper": 0.0}, "lower must be at most upper"),
-        ({"controls": np.zeros((3, 1))}, r"controls must have shape \(horizon, 2\)"),
-    ],
-)
-def test_a_plan_that_cannot_be_is_refused_in_a_sentence(settings, sentence):
-    settings = {"controls": np.zeros((3, 2)), "smoother": Exact(), "schedule": np.ones(1)} | settings
-    cost = GoalCost(GOAL, STAGE, TERMINAL, CONTROL)
-    with pytest.raises(ValueError, match=sentence):
-        optimise_trajectory(FunctionSystem(affine, 2, 2), cost, START, key=jax.random.key(0), **settings)
-
-
 def test_to_plan_again_compiles_nothing(compilations):
     """Nor to step a scene or to roll it out: from elsewhere, to elsewhere, with other weights and limits."""
     scene = mg.load_scene(

@@ -68,8 +68,7 @@ EXACT = {
     "wind and implicitfast": (_pendulum(option="wind='3 0 0' integrator='implicitfast'"), "wind"),
     "neither": (_pendulum(flag="<flag spring='disable' damper='disable'/>"), "flag eulerdamp"),
     "frictionless pyramid": (_ball(friction="0 0 0"), "friction of floor – g"),
-    "frictionless cone": (
-        _ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
+    "frictionless cone": (_ball(friction="0 0 0", option="cone='elliptic'"), "friction of floor – g"),
     "rolls freely": (_ball(friction="1 0 0", condim=6), "friction of floor – g"),
     "frictionless pair": (
         _ball(rest="<contact><pair geom1='g' geom2='floor' friction='0 0 0 0 0'/></contact>"),
@@ -256,6 +255,6 @@ def test_a_muscle_has_a_derivative_in_single_precision():
     with jax.enable_x64(False):
         scene = load_scene(source)
         data = scene.data.replace(act=jnp.array([0.1]), ctrl=jnp.array([0.3]))
-        found = jax.grad(lambda act: forward(scene.model, data.replace(act=act)).act_dot[0])(data.act)
+        found = jax.jit(jax.grad(lambda act: forward(scene.model, data.replace(act=act)).act_dot[0]))(data.act)
     # The rate is (u - a) / (0.01 (0.5 + 1.5 a)), whose derivative by a is -(0.5 + 1.5 u) / (0.01 (0.5 + 1.5 a)^2).
     np.testing.assert_allclose(found, -0.95 / (0.01 * 0.65**2), rtol=1e-5)

@@ -1,6 +1,5 @@
 """A scene that would load for minutes is refused at once."""
 
-import mujoco
 import pytest
 
 import mjxgrad as mg
@@ -26,7 +25,3 @@ def test_pairs_that_are_excluded_do_not_count(monkeypatch):
     apart = "</worldbody><contact><exclude body1='one' body2='other'/></contact>"
     named = _balls(3).replace("<body", "<body name='one'", 1).replace("<body p", "<body name='other' p", 1)
     assert len(mg.load_scene(named.replace("</worldbody>", apart)).pairs) == 2
-
-
-def test_a_spec_loads_as_its_mjcf_does():
-    assert mg.load_scene(mujoco.MjSpec.from_string(_balls(2))).pairs == mg.load_scene(_balls(2)).pairs

@@ -64,16 +64,12 @@ REFUSED = {
     "contact without width": (_fill(BALL, geom="solimp='.1 .95 0'"), "geom_solimp of geom 'g'", "width"),
     "limit without width": (
         _fill(PENDULUM, joint="limited='true' range='-5 -1' solimplimit='.2 .9 0'"), "jnt_solimp of joint 'j'", "width"),
-    "joint stiffness polynomial": (
-        _fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
-    "joint damping polynomial": (
-        _fill(PENDULUM, joint="damping='1 2 3'"), "joint 'j'", "linear coefficient"),
+    "joint stiffness polynomial": (_fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
+    "joint damping polynomial": (_fill(PENDULUM, joint="damping='1 2 3'"), "joint 'j'", "linear coefficient"),
     "tendon stiffness polynomial": (
         _fill(PENDULUM, rest=FIXED_TENDON.format("stiffness='1 2 3'")), "tendon 't'", "linear"),
-    "tendon damping polynomial": (
-        _fill(PENDULUM, rest=FIXED_TENDON.format("damping='1 2 3'")), "tendon 't'", "linear"),
-    "actuator damping polynomial": (
-        _fill(PENDULUM, rest=_actuator("damping='0.3 0.2 0.1'")), "actuator 'a'", "linear"),
+    "tendon damping polynomial": (_fill(PENDULUM, rest=FIXED_TENDON.format("damping='1 2 3'")), "tendon 't'", "linear"),
+    "actuator damping polynomial": (_fill(PENDULUM, rest=_actuator("damping='0.3 0.2 0.1'")), "actuator 'a'", "linear"),
     "actuator armature": (_fill(PENDULUM, rest=_actuator("gear='2' armature='0.5'")), "actuator 'a'", "gear²"),
     "actuator damping": (_fill(PENDULUM, rest=_actuator("gear='2' damping='0.3'")), "actuator 'a'", "gear²"),
     "surface velocity": (_fill(BALL, geom="surfacevel='1 0 0 0 0 0'"), "geom 'g'", "joint"),
@@ -97,12 +93,8 @@ REFUSED = {
     "user dynamics": (
         _fill(PENDULUM, rest=_actuator("dyntype='user' actdim='1'", "general")),
         "actuator 'a' (user)", "filterexact"),
-    "user gain": (
-        _fill(PENDULUM, rest=_actuator("gaintype='user'", "general")), "actuator 'a' (user)",
-        "affine"),
-    "user bias": (
-        _fill(PENDULUM, rest=_actuator("biastype='user'", "general")), "actuator 'a' (user)",
-        "affine"),
+    "user gain": (_fill(PENDULUM, rest=_actuator("gaintype='user'", "general")), "actuator 'a' (user)", "affine"),
+    "user bias": (_fill(PENDULUM, rest=_actuator("biastype='user'", "general")), "actuator 'a' (user)", "affine"),
     "disabled actuator group": (
         _fill(PENDULUM, option="actuatorgroupdisable='1'", rest=_actuator("group='1'")),
         "actuator 'a'", "actuatorgroupdisable"),
@@ -110,15 +102,12 @@ REFUSED = {
         _fill(PENDULUM,
               rest=_actuator("dyntype='filter' dynprm='0.1' actearly='true'", "general")),
         "actuator 'a'", "actearly"),
-    "delay": (
-        _fill(PENDULUM, rest=_actuator("delay='0.02' nsample='5'")), "actuator 'a'", "nsample"),
-    "mixed solref": (
-        _fill(BALL, geom="solref='0.02 -5'"), "0.02 -5 in geom_solref of geom 'g'", "positive"),
+    "delay": (_fill(PENDULUM, rest=_actuator("delay='0.02' nsample='5'")), "actuator 'a'", "nsample"),
+    "mixed solref": (_fill(BALL, geom="solref='0.02 -5'"), "0.02 -5 in geom_solref of geom 'g'", "positive"),
     "mixed solref of an equality": (
         _fill(PENDULUM, rest="<equality><joint name='e' joint1='j' solref='0.02 -5'/></equality>"),
         "0.02 -5 in eq_solref of equality 'e'", "positive"),
-    "limit at both ends": (
-        _fill(PENDULUM, joint="range='-5 5' limited='true' margin='0.1'"), "joint 'j'", "half"),
+    "limit at both ends": (_fill(PENDULUM, joint="range='-5 5' limited='true' margin='0.1'"), "joint 'j'", "half"),
     "tendon limit at both ends": (
         _fill(PENDULUM, rest=FIXED_TENDON.format("range='-.1 .1' limited='true' margin='.2'")),
         "tendon 't'", "half"),
@@ -186,8 +175,7 @@ def test_contact_by_a_search_on_distance_fields_is_refused(kinds):
 
 
 @pytest.mark.parametrize(
-    "how",
-    [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}],
+    "how", [{"mask": 'contype="2"'}, {"contact": '<contact><exclude body1="p" body2="q"/></contact>'}]
 )
 @pytest.mark.filterwarnings("error")
 def test_of_what_cannot_touch_no_search_is_refused(how):

@@ -1,6 +1,5 @@
 """The summary tells a human what there is."""
 
-import jax
 import pytest
 
 from mjxgrad.contact import Softness
@@ -68,18 +67,3 @@ def test_equal_pairs_share_a_line():
     text = load_scene(f"<mujoco><worldbody>{balls}</worldbody></mujoco>").summary()
     assert "36 pairs of geoms can touch" in text
     assert "+ 35 more" in text
-
-
-def test_columns_are_aligned(scene):
-    lines = scene.summary().splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith("Contact:"))
-    table = lines[start + 1 : start + 5]
-    assert len({len(line) for line in table}) == 1
-    assert max(len(line) for line in lines) <= 120
-
-
-def test_a_batch_has_no_summary(scene):
-    sweep = Softness(stiffness=[1e2, 1e3], damping_ratio=[1, 1])
-    batch = jax.vmap(scene.with_softness)(sweep)
-    with pytest.raises(ValueError, match="one scene with known values"):
-        batch.summary()

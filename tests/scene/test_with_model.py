@@ -34,25 +34,6 @@ def test_a_replaced_number_acts_and_is_differentiated(scene):
     np.testing.assert_allclose([value, slope[0]], [expected, -(H / 2) * expected**2], rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        (
-            {"dof_dampng": np.ones(1)},
-            "must name arrays of numbers of the MJX model, got dof_dampng; did you mean dof_damping",
-        ),
-        ({"geom_type": np.ones(1)}, "must name arrays of numbers of the MJX model, got geom_type"),
-        ({"dof_damping": 5.0}, r"dof_damping must have shape \(1,\) in this scene, got \(\)"),
-        ({"body_mass": [0.0, -1]}, "body_mass must not be negative, got -1"),
-        ({"geom_size": [[-0.1, 0, 0]]}, "geom_size must not be negative, got -0.1"),
-        ({"timestep": 0.0}, "timestep must be positive, got 0"),
-    ],
-)
-def test_a_field_that_is_none_or_of_another_shape_or_sign_is_refused(scene, fields, message):
-    with pytest.raises(ValueError, match=message):
-        scene.with_model(**{name: jnp.asarray(value) for name, value in fields.items()})
-
-
 def test_a_mass_and_a_damping_are_taken_without_a_word(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -149,7 +130,7 @@ def test_time_step_and_gravity_are_replaced_under_grad_and_vmap():
         return mg.rollout(moved, mg.initial_state(moved), horizon=10).qpos[-1, 2]
 
     steps, pulls = jnp.array([0.01, 0.02]), jnp.array([-9.81, 0.0])
-    values, slopes = jax.vmap(jax.value_and_grad(height, (0, 1)))(steps, pulls)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(height, (0, 1))))(steps, pulls)
     np.testing.assert_allclose(values, 55 * pulls * steps**2, atol=1e-15)
     np.testing.assert_allclose(slopes[0], 110 * pulls * steps, atol=1e-13)
     np.testing.assert_allclose(slopes[1], 55 * steps**2, rtol=1e-12)

@@ -14,7 +14,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.batched import linear
 from mjxgrad.bodies import kinematics
 from mjxgrad.bodies.kinematics import inertia_of
-from mjxgrad.contact.collision import collide, slot_geoms
+from mjxgrad.contact.collision import collide
 from mjxgrad.solver import constraint
 from mjxgrad.solver.constraint import RowHessian
 from mjxgrad.solver.jacobian import AxisRows, ContactRows
@@ -73,17 +73,6 @@ def random():
     return np.random.default_rng(1)
 
 
-def test_the_geoms_of_a_slot_are_those_of_its_contact(rows):
-    model, data, *_ = rows
-    np.testing.assert_array_equal(slot_geoms(model, data), data._impl.contact.geom)
-
-
-def test_geoms_are_not_known_where_slots_are_given_at_run_time():
-    numbers = '<mujoco><custom><numeric name="max_contact_points" data="2"/></custom>'
-    mj_model = mujoco.MjModel.from_xml_string(numbers + SCENE[9:].format(cone="pyramidal"))
-    assert slot_geoms(mjx.put_model(mj_model), mjx.make_data(mj_model)) is None
-
-
 def test_the_matrix_is_that_of_mjx(rows):
     model, data, block, matrix = rows
     theirs = jax.jit(lambda d: mjx.make_constraint(model, d))(data)._impl.efc_J
@@ -91,16 +80,12 @@ def test_the_matrix_is_that_of_mjx(rows):
     np.testing.assert_allclose(ours, theirs, atol=ROUNDING)
 
 
-def test_rates_are_the_matrix_times_a_velocity(rows, random):
+def test_rows_as_a_map_are_their_matrix_and_its_transpose(rows, random):
     model, _, block, matrix = rows
-    velocity = jnp.asarray(random.normal(size=model.nv))
-    np.testing.assert_allclose(eqx.filter_jit(block.map.mv)(velocity), matrix @ velocity, atol=ROUNDING)
-
-
-def test_the_pull_is_the_transpose(rows, random):
-    _, _, block, matrix = rows
-    force = jnp.asarray(random.normal(size=len(matrix)))
-    np.testing.assert_allclose(eqx.filter_jit(block.map.rmv)(force), matrix.T @ force, atol=ROUNDING)
+    velocity, force = (jnp.asarray(random.normal(size=size)) for size in (model.nv, len(matrix)))
+    found = jax.jit(lambda v, f: (block.map.mv(v), block.map.rmv(f)))(velocity, force)
+    for one, expected in zip(found, (matrix @ velocity, matrix.T @ force), strict=True):
+        np.testing.assert_allclose(one, expected, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("most_groups", [24, 0], ids=["by groups", "in one matrix"])

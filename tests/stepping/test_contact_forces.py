@@ -52,16 +52,3 @@ def test_the_force_between_two_geoms_is_cs(cone, condim, custom):
         on_body[model.geom(contact.geom2).name] += contact.frame.reshape(3, 3).T @ force[:3]
     np.testing.assert_allclose(found, [on_body["box"], -on_body["ball"]], rtol=1e-5, atol=1e-5)
     assert np.abs(on_body["box"]).max() > 1
-
-
-@pytest.mark.parametrize(
-    ("pair", "words"),
-    [
-        (("floor", "bal"), "no geom 'bal'; named geoms are 'floor', 'box', 'ball', 'lamp'"),
-        (("floor", "lamp"), "can never touch"),
-    ],
-)
-def test_a_pair_without_contacts_is_refused(pair, words):
-    scene = mg.load_scene(_SCENE.format(cone="pyramidal", condim=3, custom=""))
-    with pytest.raises(ValueError, match=words):
-        mg.contact_force(scene.model, scene.data, *pair)

@@ -170,20 +170,3 @@ def test_a_degenerate_pose_keeps_its_derivative(step, text):
     """The cylinder's tilt about its first contact point; a weld with nothing to correct."""
     # The cylinder's rim is chosen anew on either side of upright: an error of first order in the width, times stiffness.
     _check_jacobian(step, *_settled(text), {"rtol": 1e-4, "atol": 3e-4})
-
-
-@pytest.mark.slow
-def test_forward_over_reverse_mode_is_forward_over_forward():
-    """`jax.hessian` of two steps of a ball that is pressed on the floor and pushed along it."""
-    scene = mg.load_scene("""<mujoco><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .0995">
-        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/><geom size=".1" mass=".5"/></body>
-        </worldbody><actuator><motor joint="x"/><motor joint="z"/></actuator></mujoco>""")
-
-    def outcome(force):
-        end = mg.rollout(scene, mg.initial_state(scene), jnp.tile(force, (2, 1)))
-        return jnp.sum(end.qvel[-1] ** 2) + 1e3 * jnp.sum(end.qpos[-1])
-
-    force = jnp.array([3.0, -2.0])
-    found, expected = (jax.jit(f)(force) for f in (jax.hessian(outcome), jax.jacfwd(jax.jacfwd(outcome))))
-    # Both are exact; entries of order 1e-5 to 1e-2 of sums of terms near one.
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-10)

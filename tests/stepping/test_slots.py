@@ -27,7 +27,9 @@ def _rolled(scene, contact):
         trajectory = mg.rollout(scene, mg.initial_state(scene, qvel=velocity), horizon=HORIZON, contact=contact)
         return jnp.sin(trajectory.qpos[-1]).sum(), trajectory
 
-    return jax.jit(jax.value_and_grad(last, has_aux=True))(velocity)
+    tangent = jnp.cos(jnp.arange(float(velocity.size)))
+    _, slope, trajectory = jax.jit(lambda v: jax.jvp(last, (v,), (tangent,), has_aux=True))(velocity)
+    return trajectory, slope
 
 
 @pytest.mark.parametrize(
@@ -40,10 +42,10 @@ def test_room_for_those_that_touch_changes_neither_motion_nor_derivative(cone, c
     scenes = [mg.load_scene(SCENE.format(cone=cone), max_contacts=room) for room in (None, 4)]
     rows = [scene.data._impl.efc_J.shape[0] for scene in scenes]
     assert rows[1] < rows[0]
-    ((_, all_of_them), gradient), ((_, nearest), other) = (_rolled(scene, contact) for scene in scenes)
+    (all_of_them, slope), (nearest, other) = (_rolled(scene, contact) for scene in scenes)
     # Sums in another order, over twelve steps of impacts.
     np.testing.assert_allclose(nearest.qpos, all_of_them.qpos, atol=1e-12)
-    np.testing.assert_allclose(other, gradient, atol=1e-12 * np.abs(gradient).max())
+    np.testing.assert_allclose(other, slope, rtol=1e-11)
     assert nearest.crowded == all_of_them.crowded == 0
 
 
@@ -91,8 +93,3 @@ def test_the_first_that_finds_no_room_is_no_nearer_than_any_that_does():
     placed = scene.data.replace(geom_xpos=data.geom_xpos, geom_xmat=data.geom_xmat)
     np.testing.assert_allclose(missed(placed), expected, rtol=1e-12)
     assert first_missed(every.model, data) == np.inf
-
-
-def test_room_for_none_is_refused():
-    with pytest.raises(ValueError, match="max_contacts must be at least 1, got 0; None has room for all"):
-        mg.load_scene(SCENE.format(cone="elliptic"), max_contacts=0)

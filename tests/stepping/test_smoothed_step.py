@@ -13,7 +13,7 @@ from scipy import optimize
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import SceneWarning
-from mjxgrad.stepping import check_contact, own_motion, smoothing_warnings
+from mjxgrad.stepping import smoothing_warnings
 from tests.solver.test_smoothed_law import _nodes
 
 # A ball that can move up and sideways over a plane, and a slider with a limit; impedance rises with depth.
@@ -194,31 +194,3 @@ def test_a_scene_without_contact_is_named():
     )
     with pytest.warns(SceneWarning, match="MJCF: smoothing has no effect"):
         jax.eval_shape(lambda s: mg.rollout(scene, s, horizon=2, contact=mg.Smoothing(1e-3)), mg.initial_state(scene))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"length": 0.0}, "length must be positive and finite, got 0.0"),
-        ({"length": -1e-3}, "length must be positive"),
-        ({"length": [1e-3, np.inf]}, "length must be positive"),
-        ({"length": 1e-3, "mode": "both"}, "mode must be one of 'forward', 'backward', got 'both'"),
-    ],
-)
-def test_what_has_no_meaning_is_refused(settings, message):
-    """With the value and the choices."""
-    with pytest.raises(ValueError, match=message):
-        mg.Smoothing(**settings)
-
-
-def test_what_a_step_cannot_take_is_refused():
-    """A batch of lengths, C MuJoCo within MJX's step, and names."""
-    model, data = _scene()
-    with pytest.raises(ValueError, match="length must be one value for a step, got shape \\(2,\\)"):
-        mg.step(model, data, contact=mg.Smoothing([1e-3, 2e-3]))
-    with pytest.raises(ValueError, match=r'engine None or "mjx" in a step of MJX, got "mujoco": use mg\.rollout'):
-        mg.step(model, data, contact=mg.Slope("mujoco"))
-    with pytest.raises(ValueError, match=r"mg\.Slope\(\), mg\.Onset\(\) or mg\.Smoothing\(\), got \"slope\""):
-        check_contact("slope")
-    with pytest.raises(ValueError, match="gradient must be one of 'discrete', 'slope', got 'event'"):
-        own_motion("event")

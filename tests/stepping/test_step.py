@@ -203,7 +203,7 @@ def _full(data, state):
 
 @_SLOW
 def test_second_derivatives_nest():
-    """Forward over reverse through a sliding contact, in velocity, mass and friction together."""
+    """Forward over reverse, and over forward, through a sliding contact, in velocity, mass and friction together."""
     model, data = _sliding()
 
     def outcome(x):
@@ -218,6 +218,7 @@ def test_second_derivatives_nest():
     truth = (gradient(point + steps) - gradient(point - steps)) / 2e-5
     assert jnp.sum(jnp.abs(hessian) > 1e-4) > 5
     np.testing.assert_allclose(hessian, truth, rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(hessian, jax.jit(jax.jacfwd(jax.jacfwd(outcome)))(point), rtol=1e-6, atol=1e-10)
 
 
 @_SLOW

@@ -12,19 +12,10 @@ from mjxgrad.rollouts import initial_state, rollout
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import SceneTask, ball_wall, scene_path
 from mjxgrad.tasks.ball_wall import wall_softness
+from tests.objective.test_task import CART
 
 ANGLES = np.concatenate([np.arange(0.3, 1.2, 0.02), [0.612, 0.614]])
 SOFT, STIFF = 10.0, 1e4
-
-CART = """
-<mujoco>
-  <option timestep="0.05"/>
-  <worldbody>
-    <body><joint name="x" type="slide" axis="1 0 0" damping="0.1"/><geom size="0.1" mass="2"/></body>
-  </worldbody>
-  <actuator><motor joint="x"/></actuator>
-</mujoco>
-"""
 
 
 @pytest.fixture(scope="session")

@@ -10,12 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from experiments.problems.comparison import (
-    affordable,
-    bias_interval,
-    compare,
-    root_mean_square_interval,
-)
+from experiments.problems.comparison import affordable, bias_interval, compare, root_mean_square_interval
 from mjxgrad.estimators import first_order, zeroth_order
 from mjxgrad.objective import parameter_noise
 from tests.estimators.textbook import ramp, ramp_probability, step, step_gradient
@@ -75,13 +70,7 @@ def table():
     """Four estimators on the ramp, against its closed form."""
     estimators = {"first": first_order, "zeroth": zeroth_order, "pairs": PAIRS, "zero noise": ZERO_NOISE}
     return compare(
-        estimators,
-        RAMP,
-        jnp.array([POINT]),
-        jax.random.key(0),
-        budget=51,
-        reference=[TRUTH],
-        num_repeats=1000,
+        estimators, RAMP, jnp.array([POINT]), jax.random.key(0), budget=51, reference=[TRUTH], num_repeats=1000
     )
 
 
