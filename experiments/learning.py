@@ -81,6 +81,10 @@ class Settings(RunSettings):
     """Learning rate of the policy; if left out, the algorithm's."""
     critic_rate: Positive = 2e-3
     """Learning rate of the value function."""
+    trace: Annotated[float, Field(ge=0, le=1)] = learning.Settings.trace
+    """λ of the returns that a policy climbs; below 1 derivatives reach less far."""
+    largest_sample: Positive = learning.Settings.largest_sample
+    """Longer first-order gradients are shortened to it; in units of zeroth-order noise."""
     size: Literal["quick", "default", "full"] = "default"
     """How much is spent."""
     sizes: Sizes
@@ -302,6 +306,8 @@ def _how(settings: Settings, method: Method) -> learning.Settings:
         num_environments=settings.sizes.num_environments,
         window=settings.window,
         critic_rate=settings.critic_rate,
+        trace=settings.trace,
+        largest_sample=settings.largest_sample,
         rule=rules.get(method, FixedAlpha(1.0)),
         **changes,
     )

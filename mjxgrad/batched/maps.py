@@ -15,8 +15,11 @@ a matrix product needs. There linear and bilinear maps are sums of gathers, whic
 The norms here have a derivative of zero at zero, where the usual norm has none.
 """
 
+import dataclasses
+import functools
 import inspect
 import itertools
+import operator
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -58,7 +61,7 @@ def combine(matrix: np.ndarray, x: Float[Array, "n *item"]) -> Float[Array, "m *
     """Return the weighted sums of items, one for each row of a constant matrix."""
     if matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, np.eye(len(matrix))):
         return x
-    return _linear.bind(x, matrix=_Matrix(np.asarray(matrix, float)), batch=0)
+    return _linear.bind(x, matrix=_constant(matrix), batch=0)
 
 
 def pick(
@@ -93,7 +96,7 @@ def _choose_jvp(primals, tangents):
 
 def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
     """Return the scalar product of each item."""
-    return Bilinear(np.eye(a.shape[1])[None])(a, b)[:, 0]
+    return _products(a.shape[1])(a, b)[:, 0]
 
 
 @jax.custom_jvp
@@ -105,8 +108,18 @@ def scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n
 @scale.defjvp
 def _scale_jvp(primals, tangents):
     (factor, x), (change, dx) = primals, tangents
-    scaled = Bilinear(np.eye(x.shape[1])[:, None])
+    scaled = _multiples(x.shape[1])
     return scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
+
+
+@functools.cache
+def _products(size: int) -> Bilinear:
+    return Bilinear(np.eye(size)[None])
+
+
+@functools.cache
+def _multiples(size: int) -> Bilinear:
+    return Bilinear(np.eye(size)[:, None])
 
 
 def contract(subscripts: str, a: Array, b: Array) -> Array:
@@ -130,12 +143,9 @@ def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
 # Shared by all primitives. The first `batch` axes of all arrays are those of `jax.vmap`.
 
 
-def _define(name: str, shape: Callable, evaluate: Callable, on_gpu: Callable) -> Primitive:
+def _define(name: str, infer: Callable, evaluate: Callable, on_gpu: Callable) -> Primitive:
     """Return a primitive without its derivative."""
     primitive = Primitive(name)
-
-    def infer(*factors, **parameters):
-        return jax.core.ShapedArray(shape(*factors, **parameters), factors[0].dtype)
 
     def batch_last(*factors, batch, **parameters):
         factors = [_batch_last(x, batch) for x in factors]
@@ -170,6 +180,12 @@ def _batch_last(x: Array, batch: int) -> Array:
 def _ordered(terms: Iterable[Term]) -> tuple[Term, ...]:
     """Return the terms sorted by entry of the result, added terms before subtracted ones."""
     return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
+
+
+@functools.cache
+def _transposed(terms: tuple[Term, ...], places: tuple[int, int, int]) -> tuple[Term, ...]:
+    """Return the terms with other places for entries of the result and of the factors."""
+    return _ordered(map(operator.itemgetter(*places, 3), terms))
 
 
 def _bilinear_by_slices(a: Array, b: Array, *, terms: tuple[Term, ...], size: int, batch: int) -> Array:
@@ -219,18 +235,16 @@ def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
 
 
 def _transpose_first(cotangent, a, b, *, terms, size, batch):
-    swapped = _ordered([(i, k, j, c) for k, i, j, c in terms])
-    return _bilinear.bind(cotangent, b, terms=swapped, size=a.aval.shape[-1], batch=batch)
+    return _bilinear.bind(cotangent, b, terms=_transposed(terms, (1, 0, 2)), size=a.aval.shape[-1], batch=batch)
 
 
 def _transpose_second(cotangent, a, b, *, terms, size, batch):
-    swapped = _ordered([(j, i, k, c) for k, i, j, c in terms])
-    return _bilinear.bind(a, cotangent, terms=swapped, size=b.aval.shape[-1], batch=batch)
+    return _bilinear.bind(a, cotangent, terms=_transposed(terms, (2, 1, 0)), size=b.aval.shape[-1], batch=batch)
 
 
 _bilinear = _define(
     "bilinear",
-    lambda a, b, *, terms, size, batch: (*a.shape[:-1], size),
+    lambda a, b, *, terms, size, batch: jax.core.ShapedArray((*a.shape[:-1], size), a.dtype),
     _bilinear_by_slices,
     _bilinear_by_gathers,
 )
@@ -240,18 +254,21 @@ ad.defbilinear(_bilinear, _transpose_first, _transpose_second)
 # The linear map.
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class _Matrix:
-    """A constant matrix, compared by its entries."""
+    """A constant matrix; there is one object for all of equal entries, so that JAX compares them quickly."""
 
-    def __init__(self, entries: np.ndarray):
-        self.entries = entries
-        self._contents = entries.shape, entries.tobytes()
+    entries: np.ndarray
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Matrix) and self._contents == other._contents
 
-    def __hash__(self) -> int:
-        return hash(self._contents)
+def _constant(entries: np.ndarray) -> _Matrix:
+    entries = np.asarray(entries, float)
+    return _kept(entries.shape, entries.tobytes())
+
+
+@functools.cache
+def _kept(shape: tuple[int, int], contents: bytes) -> _Matrix:
+    return _Matrix(np.frombuffer(contents).reshape(shape))
 
 
 def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
@@ -305,7 +322,7 @@ def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
     is_term = rows != 0
     count = int(is_term.sum(axis=1).max(initial=0))
     if not 0 < count <= _MOST_GATHERED:
-        return _linear_by_product(x, matrix=_Matrix(rows), batch=batch)
+        return _linear_by_product(x, matrix=_constant(rows), batch=batch)
     order = np.argsort(~is_term, axis=1, kind="stable")[:, :count]
     weights = np.take_along_axis(rows, order, axis=1)
     order = np.where(weights != 0, order, order[:, :1])
@@ -318,12 +335,14 @@ def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
 
 
 def _transpose_linear(cotangent, x, *, matrix, batch):
-    return (_linear.bind(cotangent, matrix=_Matrix(matrix.entries.T.copy()), batch=batch),)
+    return (_linear.bind(cotangent, matrix=_constant(matrix.entries.T), batch=batch),)
 
 
 _linear = _define(
     "linear",
-    lambda x, *, matrix, batch: (*x.shape[:batch], len(matrix.entries), *x.shape[batch + 1 :]),
+    lambda x, *, matrix, batch: jax.core.ShapedArray(
+        (*x.shape[:batch], len(matrix.entries), *x.shape[batch + 1 :]), x.dtype
+    ),
     _linear_by_slices,
     _linear_by_gathers,
 )
@@ -374,7 +393,7 @@ def _contract_by_product(a: Array, b: Array, *, subscripts: _Subscripts, batch: 
 
 def _contract_shape(a, b, *, subscripts, batch):
     sizes = subscripts.sizes(a, b, batch)
-    return (*a.shape[:batch], *(sizes[letter] for letter in subscripts.result))
+    return jax.core.ShapedArray((*a.shape[:batch], *map(sizes.__getitem__, subscripts.result)), a.dtype)
 
 
 def _contract_first(cotangent, a, b, *, subscripts, batch):

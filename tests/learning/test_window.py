@@ -197,9 +197,7 @@ def test_with_the_exact_value_function_the_trace_changes_no_mean():
     def off(difference):
         return np.abs(difference.mean(axis=0)) / (difference.std(axis=0) / len(difference) ** 0.5 + 1e-12)
 
-    whole, half, none = (gradients(P, trace).first for trace in (1.0, 0.5, 0.0))
-    assert np.all(off(half - whole) < 4)
-    assert np.all(off(none - whole) < 4)
+    assert np.all(off(gradients(P, 0.5).first - gradients(P, 1.0).first) < 4)
     wrong = gradients(4 * P, 0.5)
     assert np.all(off(wrong.first - gradients(4 * P, 1.0).first)[:-1] > 6)
     assert np.all(off(wrong.zeroth - wrong.first) < 4)
