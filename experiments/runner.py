@@ -142,7 +142,8 @@ def _call(run: Run, workspace: Workspace) -> "Report":
 
         measure, words, pictures = (part(run.settings.experiment, name) for name in ("measure", "report", "figures"))
         # Before anything is measured.
-        if missing := [name for name in ("answer", "verdict", "tables") if not callable(getattr(words, name, None))]:
+        needed = {"answer": words, "verdict": words, "tables": words, "drawings": pictures}
+        if missing := [name for name, module in needed.items() if not callable(getattr(module, name, None))]:
             raise ExperimentError(
                 f"experiment {run.settings.experiment} lacks {joined(missing)}: see experiments/README.md"
             )

@@ -143,6 +143,7 @@ FOUND = {
     "estimators.rules.FixedAlpha(3.0)": "alpha must be from 0 to 1, got 3.0",
     "optimise(annealing=0.5)": "annealing must be a schedule from step to scale, got 0.5; for a fixed scale",
     "optimise(estimator='first_order')": "estimator must be a function such as functools.partial(",
+    "optimise(estimator=lambda objective, params, key: params)": "estimator must return a GradientEstimate, got",
     "optimise(optimiser='adam')": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got 'adam'",
     "optimise(optimiser=optax.adam)": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got <function",
     "optimise(num_steps=2.5)": "num_steps must be a whole number, got 2.5",

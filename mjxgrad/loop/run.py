@@ -57,7 +57,7 @@ class Method(eqx.Module):
 
     @abstractmethod
     def step(self, carry: PyTree, index: Int[Array, ""]) -> tuple[PyTree, PyTree]:
-        """Take the step of this number; return the carry after it, and the record of the step."""
+        """Take the step of this number; return the carry after it, and its record, a dict if a log is kept."""
 
     def is_over(self, carry: PyTree) -> Bool[Array, "..."] | bool:
         """Return whether a run has ended before its last step; of many runs, for each."""

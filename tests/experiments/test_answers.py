@@ -146,10 +146,10 @@ def test_the_verdict_on_stability_says_first_what_is_flagged_then_how_it_compare
     assert "2 of 3 motions are as good as C MuJoCo's, 1 worse and none better" in said
 
 
-def test_a_kind_without_an_answer_is_refused_before_anything_is_measured(tmp_path, monkeypatch):
-    silent = SimpleNamespace(measure=lambda *_: pytest.fail("measured"), verdict=str, tables=list, drawings=dict)
+def test_a_kind_without_answer_and_drawings_is_refused_before_anything_is_measured(tmp_path, monkeypatch):
+    silent = SimpleNamespace(measure=lambda *_: pytest.fail("measured"), verdict=str, tables=list)
     monkeypatch.setattr("experiments.runner.part", lambda *_: silent)
-    with pytest.raises(ExperimentError, match="lacks answer"):
+    with pytest.raises(ExperimentError, match="lacks answer and drawings"):
         _call(Run("mute", RunSettings(experiment="mute"), "", "", {}), Workspace(tmp_path))
 
 
