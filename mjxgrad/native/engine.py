@@ -240,7 +240,7 @@ class _Linearisation:
             return
         row[self.places["warmstart"]] = self.data.qacc_warmstart
         model, near, spanned, clear = self._near(model, row, after)
-        self._small(model, clear, found, self._width(near))
+        self._differentiate(model, clear, found, self._width(near))
         if near is None:
             return
         matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
@@ -324,7 +324,7 @@ class _Linearisation:
             columns.append(self._difference(model, *ends) / (2 * width))
         return np.array(columns).T
 
-    def _small(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
+    def _differentiate(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
         """Write differences of this width by all that is wanted."""
         nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         by_control = found.get("ctrl", np.zeros((len(found["state"]), nu)))
