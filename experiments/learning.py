@@ -261,7 +261,9 @@ def _by_ppo(
     reward = np.stack(rewards, axis=1)
     known = {"reward": reward, "seconds": np.full_like(reward, seconds / num_updates)}
     counts = {name: np.zeros_like(reward) for name in ("not_finite", "skipped", "diverged", "shortened")}
-    unknown = {name: np.full_like(reward, np.nan) for name in ("alpha", "first_variance", "zeroth_variance")}
+    unknown = {
+        name: np.full_like(reward, np.nan) for name in ("alpha", "agreement", "first_variance", "zeroth_variance")
+    }
     return jax.tree.map(lambda *x: jnp.stack(x), *learned), acts[0], {**known, **counts, **unknown}
 
 
@@ -386,7 +388,8 @@ def findings(outcome: Outcome) -> list[str]:
     shares = [(course, float(course.history["shortened"].mean())) for course in outcome.courses]
     if each := [f"{100 * share:.2g}% ({_label(c, outcome)})" for c, share in shares if share and c.method != "zeroth"]:
         sentences.append(
-            f"Derivatives longer than 0.3 times zeroth-order noise were shortened to that: {joined(each)}."
+            f"Derivatives longer than {outcome.settings.largest_sample:g} times zeroth-order noise were shortened to that: "
+            f"{joined(each)}."
         )
     lost = []
     for course in outcome.courses:
@@ -398,6 +401,13 @@ def findings(outcome: Outcome) -> list[str]:
                 f"steps diverged, {skipped} updates were skipped."
             )
     sentences += lost or ["Every derivative was a number, no step diverged, and no update was skipped."]
+    agreements = [
+        (course, float(np.nanmean(course.history["agreement"]))) for course in outcome.courses if course.method != "ppo"
+    ]
+    if each := [f"{cosine:.2f} ({_label(course, outcome)})" for course, cosine in agreements]:
+        sentences.append(
+            f"Gradients of two halves of the environments agree by a cosine of {joined(each)}; where it is near 0, take more."
+        )
     if outcome.settings.environment == "quadruped":
         each = []
         for course in outcome.courses:

@@ -62,6 +62,7 @@ def learn(
 
     - `reward`, mean per step; `return`, mean over the episodes that ended, NaN without any;
     - `alpha`, mean weight of first order; `gradient_norm`, norm of the gradient by the parameters;
+    - `agreement`, cosine between the gradients of two halves of the environments: near 0 they are noise;
     - `first_variance` and `zeroth_variance`, variances of one environment's gradient by its actions; `squared_bias`, squared
       difference of their means minus the part that noise explains, which may be negative;
     - `ended`, share of windows in which an episode ended for good: no derivative passes such an end;

@@ -4,6 +4,7 @@ Another learner is another file like this one: a carry with everything that an u
 """
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -184,8 +185,12 @@ class ActorCritic(Method):
             return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(window.obs)
 
         _, pull_back = jax.vjp(acted, policy.actor)
-        # Optimisers descend, so the gradient is that of the negative mean return per step.
-        (gradient,) = pull_back(-mixture / (self.settings.num_environments * self.settings.window))
+        count = self.settings.num_environments
+        is_first = jnp.arange(count) < count // 2
+        # Optimisers descend, so the gradient is that of the negative mean return per step; of each half of the environments.
+        slope = -mixture / (count * self.settings.window)
+        halves = [pull_back(jnp.where(own[:, None, None], slope, 0))[0] for own in (is_first, ~is_first)]
+        gradient = optax.tree.add(*halves)
         norm = optax.tree.norm(gradient)
         is_finite = jnp.isfinite(norm)
         optimiser, _ = optimisers(self.settings, self.num_updates)
@@ -196,6 +201,7 @@ class ActorCritic(Method):
         found = {
             "alpha": weights.alpha.mean(),
             "gradient_norm": norm,
+            "agreement": optax.tree.vdot(*halves) / math.prod(map(optax.tree.norm, halves)),
             "first_variance": evidence.first_variance.sum(),
             "zeroth_variance": evidence.zeroth_variance.sum(),
             "squared_bias": (evidence.difference_norm**2 - evidence.difference_variance / evidence.real_count).sum(),

@@ -324,7 +324,9 @@ class _Linearisation:
             columns.append(self._difference(model, *ends) / (2 * width))
         return np.array(columns).T
 
-    def _differentiate(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
+    def _differentiate(
+        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float
+    ) -> None:
         """Write differences of this width by all that is wanted."""
         nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         by_control = found.get("ctrl", np.zeros((len(found["state"]), nu)))

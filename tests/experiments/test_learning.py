@@ -23,7 +23,17 @@ QUICK = Settings(
 
 
 def course(method, returns, **history):
-    names = ("reward", "alpha", "first_variance", "zeroth_variance", "not_finite", "skipped", "diverged", "shortened")
+    names = (
+        "reward",
+        "alpha",
+        "agreement",
+        "first_variance",
+        "zeroth_variance",
+        "not_finite",
+        "skipped",
+        "diverged",
+        "shortened",
+    )
     values = {name: np.ones((4, 2)) if "variance" in name else np.zeros((4, 2)) for name in names}
     values |= {name: np.asarray(value, float) for name, value in history.items()}
     returns = np.asarray(returns, float)

@@ -171,7 +171,7 @@ def test_an_evaluation_ends_with_the_episode(cartpole, key):
 
 
 def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
-    """The gradient of one update against that of a plain sum over all windows; with hardly any noise, from the same starts."""
+    """The gradient of one update against that of a plain sum over windows, and of both halves; with hardly any noise."""
     settings = learning.Settings(
         num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf,
         discount=1.0, rule=FixedAlpha(1.0), has_critic=False,
@@ -187,11 +187,14 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
         def one(state):
             return jax.lax.scan(advance, state, length=3)[1].sum()
 
-        return -jax.vmap(one)(before.environments).sum() / (4 * 3)
+        return -jax.vmap(one)(before.environments) / (4 * 3)
 
-    gradient = jax.jit(jax.grad(loss))(before.policy.actor)
-    norm = np.sqrt(sum((np.asarray(x) ** 2).sum() for x in jax.tree.leaves(gradient)))
+    gradients = jax.tree.leaves(jax.jit(jax.jacrev(loss))(before.policy.actor))
+    first, second = np.concatenate([x.reshape(4, -1) for x in gradients], axis=1).reshape(2, 2, -1).sum(axis=1)
+    norm = np.linalg.norm(first + second)
     assert_allclose(run.history["gradient_norm"][0], norm, rtol=1e-6)
+    cosine = first @ second / (np.linalg.norm(first) * np.linalg.norm(second))
+    assert_allclose(run.history["agreement"][0], cosine, rtol=1e-6)
     # Windows follow one another, and nothing is fitted.
     assert run.learner.environments.num_steps.max() > 3
     assert all(not x.any() for x in jax.tree.leaves(run.learner.critic.layers[-1]))
