@@ -120,7 +120,7 @@ def check(
 
     Args:
         scene: an MJCF file.
-        cost: file.py:function or module:function, from a trajectory to its cost; modules of the current folder, too.
+        cost: file.py:function or module:function, from a trajectory to its cost; or height:body and others, see `sweep`.
         html: write a page to this file.
         quick: only fast checks, in seconds: contact, time step, parts without effect.
         budget: duration in s once the scene is loaded; the report names measurements that are left out.
@@ -128,8 +128,7 @@ def check(
     """
     _writable(html, is_page=True)
     mg, log = _library(), _timed()
-    function = None if cost is None else importlib.import_module("mjxgrad.checking.sweep").load_function(cost)
-    verdict = mg.check(_existing(scene), function, derivatives=not quick, budget=budget, seed=seed, log=log)
+    verdict = mg.check(_existing(scene), cost, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)
     if html is not None:
         html.write_text(verdict.as_html(), encoding="utf-8")

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
 
 from mjxgrad._text import format_number
 from mjxgrad.checking import findings
+from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Measured, Noise, measure
@@ -23,10 +23,8 @@ from mjxgrad.checking.motions import Motions, first_keyframe, half_range, most_c
 from mjxgrad.checking.moving import Mover, Outcomes
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page
-from mjxgrad.rollouts import Trajectory
-from mjxgrad.scene import Scene, load_scene
+from mjxgrad.scene import Scene, SceneWarning, load_scene
 
-Cost = Callable[[Trajectory], Float[Array, "..."]]
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
 _SMALL = 12  # degrees of freedom up to which a batch has the first of these numbers of motions, else the second
 _BATCHES = (64, 32)
@@ -102,7 +100,7 @@ class Verdict:
 
 def check(
     source: Source,
-    cost: Cost | None = None,
+    cost: str | Cost | None = None,
     *,
     derivatives: bool = True,
     budget: int | float = 12.0,
@@ -117,8 +115,8 @@ def check(
 
     Args:
         source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
-        cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it; motions are then simulated
-            from their start. None uses random mixes of final positions and velocities.
+        cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it, or its name as in `sweep`;
+            motions are then simulated from their start. None uses random mixes of final positions and velocities.
         derivatives: whether to measure derivatives; False looks at motions alone.
         budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
             measurements that are left out.
@@ -139,6 +137,7 @@ def check(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene, path = _load(source)
+        cost = named_cost(scene, cost) if isinstance(cost, str) else cost
         started = time.perf_counter()
         motions = random_motions(scene, rng)
         scene, max_contacts = _with_room(scene, motions)
@@ -193,10 +192,21 @@ def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
 
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
-    for message in dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)):
-        # A separate finding tells where the time step is too long.
-        if "refsafe" not in message and "h²k" not in message:
-            yield Finding("note", message.partition(": ")[2][:1].upper() + message.partition(": ")[2][1:] + ".")
+    """Yield what the library warned of, without the scene's name; of other libraries' warnings the first of each kind."""
+    own = dict.fromkeys(str(one.message).partition(": ")[2] for one in caught if issubclass(one.category, SceneWarning))
+    # A separate finding tells where the time step is too long.
+    texts = [text for text in own if "refsafe" not in text and "h²k" not in text]
+    others = [
+        one for one in caught if issubclass(one.category, UserWarning) and not issubclass(one.category, SceneWarning)
+    ]
+    by_line: dict[tuple[str, int], set[str]] = {}
+    for one in others:
+        by_line.setdefault((one.filename, one.lineno), set()).add(str(one.message))
+    for messages in by_line.values():
+        first, *more = sorted(messages)
+        texts.append(first.rstrip(".") + (f" ({len(more)} more alike)" if more else ""))
+    for text in texts:
+        yield Finding("note", f"{text[:1].upper()}{text[1:]}.")
 
 
 def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tuple[tuple[str, ...], Outcomes]:

@@ -148,7 +148,12 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
     read = [one for one in found if one.num_readings]
     parts = [f"{WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
     lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
-    return Finding("slope", f"{lead} {' '.join(parts)}")
+    return Finding("slope", f"{lead} {' '.join(parts)}", is_fault=_is_mostly_off(found))
+
+
+def _is_mostly_off(found: Sequence[Slope]) -> bool:
+    """Return whether each kind of derivative is off at more than half of the readings."""
+    return all(2 * one.num_off > one.num_readings for one in found)
 
 
 def _time_step_findings(measured: Measured) -> Iterator[Finding]:
@@ -218,7 +223,7 @@ def recommend(
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
         return Recommendation("slope", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
-    slope, discrete = slopes(measured)
+    slope, discrete = found = slopes(measured)
     # Where both are the slope, MuJoCo's own derivative is cheaper and more common.
     is_exact = discrete.num_readings > 0 and discrete.num_off == 0 and discrete.error <= _CLOSE
     is_better = discrete.num_readings > 0 and discrete.num_off < slope.num_off
@@ -235,7 +240,7 @@ def recommend(
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
         gradient=best.kind,
-        estimator="alpha_order" if has_jumps or is_limited or not own else "first_order",
+        estimator="alpha_order" if has_jumps or is_limited or not own or _is_mostly_off(found) else "first_order",
         stddev=stddev,
         horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),
         timestep=timestep,
@@ -285,6 +290,7 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",
         "explodes": "the derivative explodes",
+        "slope": "most derivatives are not the slope",
         "many_pairs": "too many pairs can touch",
         "not_measured": "derivatives were not measured",
     }

@@ -1,27 +1,22 @@
 """Bias and variance of gradients over contact stiffness, for a scene, cost and start given by names."""
 
 import functools
-import importlib
-import runpy
-import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._arrays import is_known
 from mjxgrad._text import format_number
-from mjxgrad.bodies.kinematics import kinematics
-from mjxgrad.checking.check import Cost, Source, _outcomes
+from mjxgrad.checking.check import Source, _outcomes
+from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.motions import half_range
 from mjxgrad.checking.moving import CONTACT_FIELDS, compiler_options
 from mjxgrad.contact import Softness
@@ -31,12 +26,11 @@ from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.objective.task import SceneTask
 from mjxgrad.report import Block, Table, page, svg
-from mjxgrad.rollouts import Trajectory, initial_state
+from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 from mjxgrad.stepping import Contact, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
-_BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # costs, and the number of bodies or sites of each
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
 _NONE, _BLIND = 0.05, 0.5  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
@@ -72,63 +66,10 @@ def scene_task(
     if cost is None:
         outcomes = _outcomes(scene, None, np.random.default_rng(seed))[1]
         cost = lambda trajectory: outcomes(trajectory)[0]  # noqa: E731
-    cost = _named_cost(scene, cost) if isinstance(cost, str) else cost
+    cost = named_cost(scene, cost) if isinstance(cost, str) else cost
     usual = int(np.clip(round(_SECONDS / model.opt.timestep), _FEWEST_STEPS, _MOST_STEPS))
     horizon = usual if horizon is None else horizon
     return SceneTask(scene, state, cost, horizon, contact=contact)  # pyright: ignore[reportCallIssue]
-
-
-def load_function(name: str) -> Callable[..., Any]:
-    """Return a function by file.py:function or module:function, the module also in the current folder."""
-    source, _, function = name.rpartition(":")
-    if source.endswith(".py") and not Path(source).is_file():
-        raise ValueError(f"cost: there is no file {source}")
-    try:
-        sys.path.insert(0, str(Path.cwd()))
-        names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
-    except Exception as error:  # a user's file may raise anything
-        forms = "file.py:function, module:function, or of a body as height:torso"
-        raise ValueError(f"cost must be {forms}, got {name!r}: {error}") from error
-    if not callable(names.get(function)):
-        there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
-        raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
-    return names[function]
-
-
-def _named_cost(scene: Scene, name: str) -> Cost:
-    kind, _, what = name.partition(":")
-    if kind not in _BUILT_IN:
-        return load_function(name)
-    if len(names := what.split("/")) != _BUILT_IN[kind]:
-        raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")
-    found = [_body_or_site(scene.mj_model, name) for name in names]
-    data, seconds = scene.data, scene.mj_model.opt.timestep
-
-    def frames(qpos: Float[Array, " nq"]) -> list[tuple[Array, Array]]:
-        placed = kinematics(scene.model, data.replace(qpos=qpos))
-        parts = {True: (placed.xpos, placed.xmat), False: (placed.site_xpos, placed.site_xmat)}
-        return [(place[i], turn[i]) for i, is_body in found for place, turn in [parts[is_body]]]
-
-    def cost(trajectory: Trajectory) -> Float[Array, ""]:
-        (place, turn), *other = frames(trajectory.qpos[-1])
-        if kind == "reach":
-            return jnp.linalg.norm(place - other[0][0])
-        if kind == "speed":
-            return (frames(trajectory.qpos[0])[0][0] - place)[0] / (seconds * len(trajectory.ctrl))
-        return -place[2] if kind == "height" else 1 - turn[2, 2]
-
-    return cost
-
-
-def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
-    """Return the id of a named body or site, and whether it is a body."""
-    counts = {"body": (model.nbody, model.body), "site": (model.nsite, model.site)}
-    known = {kind: [at(i).name for i in range(count)] for kind, (count, at) in counts.items()}
-    for kind, names in known.items():
-        if name in names:
-            return names.index(name), kind == "body"
-    there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
-    raise ValueError(f"there is no body or site {name!r} in the scene, but {there}")
 
 
 class CommonShift(OpenLoop):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.checking import findings
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
 from mjxgrad.checking.measure import Line, Measured, crossing, estimates, measure
@@ -357,3 +358,22 @@ def test_gymnasiums_scenes_get_a_verdict_without_a_false_alarm(name):
     slope, discrete = slopes(verdict.measured)
     # Where nothing lands, both are the same to rounding.
     assert not slope.error > 1.01 * discrete.error
+
+
+def test_warnings_of_mjx_are_said_once_and_none_is_empty():
+    """MJX warns of each mesh whose face has more than 20 corners; two of them are one sentence."""
+    circle = [f"{np.cos(a):.4f} {np.sin(a):.4f} {z}" for a in np.linspace(0, 2 * np.pi, 30, False) for z in (0, 1)]
+    meshes = "".join(f'<mesh name="m{i}" vertex="{" ".join(circle)}"/>' for i in range(2))
+    bodies = "".join(f'<body pos="{3 * i} 0 1"><freejoint/><geom type="mesh" mesh="m{i}"/></body>' for i in range(2))
+    verdict = mg.check(f"<mujoco><asset>{meshes}</asset><worldbody>{bodies}</worldbody></mujoco>", derivatives=False)
+    texts = [one.text for one in verdict.findings]
+    assert sum("coplanar" in text for text in texts) == 1
+    assert all(len(text) > 5 for text in texts)
+
+
+@pytest.mark.parametrize(("num_off", "is_fault"), [((15, 23), True), ((11, 23), False), ((0, 0), False)])
+def test_derivatives_that_are_mostly_off_are_a_fault(num_off, is_fault):
+    """Where one kind is right at half of 23 readings it is recommended without a word."""
+    kinds = zip(("slope", "discrete"), num_off, strict=True)
+    found = findings._slope_finding([findings.Slope(kind, off, 23, 0.3) for kind, off in kinds])
+    assert found.is_fault == is_fault

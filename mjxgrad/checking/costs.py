@@ -1,0 +1,73 @@
+"""Costs by name: functions of files and modules, and height, speed, uprightness and reach of bodies."""
+
+import importlib
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Float
+
+from mjxgrad.bodies.kinematics import kinematics
+from mjxgrad.rollouts import Trajectory
+from mjxgrad.scene import Scene
+
+Cost = Callable[[Trajectory], Float[Array, "..."]]
+_BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # costs, and the number of bodies or sites of each
+
+
+def named_cost(scene: Scene, name: str) -> Cost:
+    """Return a cost by its name: of a file, of a module, or of a body or site of the scene."""
+    kind, _, what = name.partition(":")
+    if kind not in _BUILT_IN:
+        return _function(name)
+    if len(names := what.split("/")) != _BUILT_IN[kind]:
+        raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")
+    found = [_body_or_site(scene.mj_model, name) for name in names]
+    data, seconds = scene.data, scene.mj_model.opt.timestep
+
+    def frames(qpos: Float[Array, " nq"]) -> list[tuple[Array, Array]]:
+        placed = kinematics(scene.model, data.replace(qpos=qpos))
+        parts = {True: (placed.xpos, placed.xmat), False: (placed.site_xpos, placed.site_xmat)}
+        return [(place[i], turn[i]) for i, is_body in found for place, turn in [parts[is_body]]]
+
+    def cost(trajectory: Trajectory) -> Float[Array, ""]:
+        (place, turn), *other = frames(trajectory.qpos[-1])
+        if kind == "reach":
+            return jnp.linalg.norm(place - other[0][0])
+        if kind == "speed":
+            return (frames(trajectory.qpos[0])[0][0] - place)[0] / (seconds * len(trajectory.ctrl))
+        return -place[2] if kind == "height" else 1 - turn[2, 2]
+
+    return cost
+
+
+def _function(name: str) -> Callable[..., Any]:
+    """Return a function by file.py:function or module:function, the module also in the current folder."""
+    source, _, function = name.rpartition(":")
+    if source.endswith(".py") and not Path(source).is_file():
+        raise ValueError(f"cost: there is no file {source}")
+    try:
+        sys.path.insert(0, str(Path.cwd()))
+        names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
+    except Exception as error:  # a user's file may raise anything
+        forms = "file.py:function, module:function, or of a body as height:torso"
+        raise ValueError(f"cost must be {forms}, got {name!r}: {error}") from error
+    if not callable(names.get(function)):
+        there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
+        raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
+    return names[function]
+
+
+def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
+    """Return the id of a named body or site, and whether it is a body."""
+    counts = {"body": (model.nbody, model.body), "site": (model.nsite, model.site)}
+    known = {kind: [at(i).name for i in range(count)] for kind, (count, at) in counts.items()}
+    for kind, names in known.items():
+        if name in names:
+            return names.index(name), kind == "body"
+    there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
+    raise ValueError(f"there is no body or site {name!r} in the scene, but {there}")
