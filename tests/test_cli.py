@@ -44,7 +44,10 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
         (["check", "nowhere.xml"], "there is no file nowhere.xml"),
         (["check", "refused.xml"], "got none (nv = 0)"),
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
-        (["check", "scene.xml", "--quick", "--cost", "height:nobody"], "there is no body or site 'nobody' in the scene"),
+        (
+            ["check", "scene.xml", "--quick", "--cost", "height:nobody"],
+            "there is no body or site 'nobody' in the scene",
+        ),
         (["chek"], 'Did you mean "check"'),
         (["new", "scene.xml", "--output", "scene.xml"], "--force"),
     ],
