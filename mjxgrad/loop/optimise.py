@@ -122,7 +122,7 @@ class GradientStep(Descent):
 
     def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
         scale, objective = self.annealed(self.objective, carry.params, index)
-        estimate = _estimated(self.estimator, objective, carry.params, jax.random.fold_in(carry.key, index))
+        estimate = _checked(self.estimator(objective, carry.params, jax.random.fold_in(carry.key, index)))
         change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
         record = Record.of_estimate(estimate, scale=scale, step_norm=jnp.linalg.norm(change), is_taken=is_taken)
         return self.moved(carry, index, carry.params + change, state, record)
@@ -201,7 +201,7 @@ def estimated_gradient(
     def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Scalar, GradientEstimate]:
         vector, restore = flattened(params)
         scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
-        estimate = _estimated(estimator, annealed, vector, jax.random.fold_in(key, step))
+        estimate = _checked(estimator(annealed, vector, jax.random.fold_in(key, step)))
         return scale, jax.tree.map(jnp.asarray, estimate)
 
     def init(params: PyTree) -> EstimatedGradientState:
@@ -226,9 +226,8 @@ def estimated_gradient(
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def _estimated(estimator: Estimator, objective: Objective, params: Vector, key: PRNGKeyArray) -> GradientEstimate:
-    """Return the estimate; an estimator of one's own may have returned something else."""
-    found = estimator(objective, params, key)
-    if not isinstance(found, GradientEstimate):
-        raise ValueError(f"estimator must return a GradientEstimate, got {type(found).__name__}")
-    return found
+def _checked(estimate: Any) -> GradientEstimate:
+    """Return an estimate, or say what an estimator of one's own must return."""
+    if not isinstance(estimate, GradientEstimate):
+        raise ValueError(f"estimator must return a GradientEstimate, got {type(estimate).__name__}")
+    return estimate
