@@ -76,7 +76,8 @@ def learn(
         environment: the environment to learn in, or several that differ only in numbers, such as the stiffness of contact.
             Several learn side by side from the same keys, and the result gets a first axis for them.
         key: consumed here; an array of keys learns one policy per key side by side, and the result gets an axis for them.
-        num_updates: total number of updates, those before a checkpoint included.
+        num_updates: total number of updates, those before a checkpoint included. A run may go on with more; rates then fall to
+            zero at the new number.
         settings: settings of the learner; None takes the defaults.
         log: function called after every `log_every` updates with their means, such as
             `lambda update, metrics: wandb.log(metrics, step=update)`.
@@ -110,6 +111,6 @@ def learn(
         checkpoint=None if checkpoint is None else Path(checkpoint),
         on_all_devices=True,
     )
-    seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (num_updates, *shape))
+    seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (len(progress.seconds), *shape))
     history = {name: jnp.asarray(values) for name, values in (progress.found | {"seconds": seconds}).items()}
     return Learned(progress.carry.policy, history, progress.carry)

@@ -76,12 +76,12 @@ class ActorCritic(Method):
     Attributes:
         environment: the environment to learn in.
         settings: settings of the learner.
-        num_updates: total number of updates, for schedules from the first to the last.
+        num_updates: total number of updates, for schedules from the first to the last; a resumed run may have another.
     """
 
     environment: Environment
     settings: Settings
-    num_updates: int
+    num_updates: Int[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def init(self, start: PRNGKeyArray) -> Learner:
         """Draw networks and starts."""
@@ -150,7 +150,10 @@ class ActorCritic(Method):
 
     def identity(self) -> dict[str, Any]:
         name = type(self.environment).__qualname__
-        return {"settings": repr(self.settings), "num_updates": self.num_updates, "environment": name}
+        return {"settings": repr(self.settings), "environment": name}
+
+    def shared(self) -> Environment:
+        return self.environment
 
     def _windows(
         self, learner: Learner, environments: EnvState, key: PRNGKeyArray, stddev: Float[Array, ""]
@@ -243,7 +246,7 @@ class ActorCritic(Method):
 
 
 def optimisers(
-    settings: Settings, num_updates: int
+    settings: Settings, num_updates: int | Int[Array, ""]
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     """Return the optimisers of the policy and of the value function."""
 
@@ -252,11 +255,14 @@ def optimisers(
         # Flattened to one vector, which takes a few operations instead of as many for each layer's arrays.
         return optax.flatten(optax.chain(clip, optax.adam(schedule, b1=0.7, b2=0.95)))
 
+    def falling(rate: float, num_steps: int | Int[Array, ""]) -> optax.Schedule:
+        return lambda count: rate * jnp.maximum(1 - count / num_steps, 0)
+
     per_update = settings.critic_iterations * settings.critic_batches
-    actor_rate = optax.linear_schedule(settings.actor_rate, 0.0, num_updates)
+    actor_rate = falling(settings.actor_rate, num_updates)
     if settings.actor_decay is not None:
         actor_rate = optax.exponential_decay(settings.actor_rate, 1, settings.actor_decay)
-    critic_rate = optax.linear_schedule(settings.critic_rate, 0.0, num_updates * per_update)
+    critic_rate = falling(settings.critic_rate, num_updates * per_update)
     return optimiser(actor_rate), optimiser(critic_rate)
 
 

@@ -64,8 +64,12 @@ class Method(eqx.Module):
         return False
 
     def identity(self) -> dict[str, Any]:
-        """Return named values that a resumed run must share, besides the program, the arrays and the start."""
+        """Return named values that a resumed run must share, besides the program, the start and `shared`."""
         return {}
+
+    def shared(self) -> PyTree:
+        """Return what arrays of the method a resumed run must share; by default all."""
+        return self
 
     def metrics(self, progress: Progress, count: int) -> dict[str, float]:
         """Return the values for a log: the means of the finite records over the last `count` steps."""
@@ -148,7 +152,7 @@ def run(
     if checkpoint is not None:
         # Classes of one name may differ in code. The lowered program has every number that is no argument, such as a rate.
         text = np.frombuffer(traced.lower().as_text().encode(), np.uint8)
-        parts = {"start": start, "arrays": numbers, "program": text}
+        parts = {"start": start, "arrays": eqx.filter(method.shared(), eqx.is_array), "program": text}
         identity = method.identity() | {name: checkpoints.digest(part) for name, part in parts.items()}
     if checkpoint is not None and checkpoint.exists():
         carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)

@@ -56,6 +56,9 @@ def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     assert same(resumed.learner, whole.learner)
     for name in whole.history.keys() - {"seconds"}:
         np.testing.assert_array_equal(resumed.history[name], whole.history[name])
+    longer = learn(num_updates=3, checkpoint=tmp_path / "run")
+    np.testing.assert_array_equal(longer.history["reward"][:2], whole.history["reward"])
+    assert int(longer.learner.num_updates) == 3
     other = learning.Settings(num_environments=4, window=3, discount=0.9)
     with pytest.raises(ValueError, match=r"of the same run, got .* settings was Settings"):
         learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
