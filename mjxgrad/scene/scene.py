@@ -311,7 +311,7 @@ def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
     yield "k", "1/s²", _numbers(parameters.stiffness)
     yield "b", "1/s", _numbers(parameters.damping)
     yield "ζ", "", _numbers(parameters.damping_ratio)
-    yield "impedance", "", [format_range(row) for row in np.asarray(parameters.impedance)]
+    yield "impedance", "", [format_range(row) for row in np.asarray(parameters.impedance).tolist()]
     yield "width", "mm", _numbers(1e3 * parameters.width)
     yield "h²k+2hb", "", _numbers(parameters.stability)
     frictions = np.asarray(parameters.friction).tolist()
