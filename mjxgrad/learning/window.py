@@ -30,7 +30,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.estimators.moments import Moments
@@ -159,11 +159,14 @@ def run_window(
     return window, final
 
 
-def _faded(state: EnvState, share: float) -> EnvState:
+def _faded(state: PyTree, share: float) -> PyTree:
     """Return the state unchanged, to the bit, with its derivative multiplied by a share."""
 
     def fade(x: Any) -> Any:
-        return x + (share - 1) * (x - jax.lax.stop_gradient(x)) if eqx.is_inexact_array(x) else x
+        if not eqx.is_inexact_array(x):
+            return x
+        # Infinity less infinity is no number, and a memory may hold infinities.
+        return x + jnp.where(jnp.isfinite(x), (share - 1) * (x - jax.lax.stop_gradient(x)), 0)
 
     return jax.tree.map(fade, state)
 

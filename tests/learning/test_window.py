@@ -16,7 +16,16 @@ from mjxgrad import envs
 from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
 from mjxgrad.learning import learner
 from mjxgrad.learning.networks import Network, Normaliser
-from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, returned, run_window, window_gradients
+from mjxgrad.learning.window import (
+    Gradients,
+    Window,
+    _faded,
+    lambda_returns,
+    mix,
+    returned,
+    run_window,
+    window_gradients,
+)
 
 STEPS, STDDEV, DISCOUNT = 3, 0.3, 0.9  # of the windows that are run
 
@@ -144,6 +153,14 @@ def test_the_blended_gradient_is_the_slope_of_each_step_s_lambda_return(cartpole
         change = jnp.zeros_like(noise).at[t].set(1e-5)
         slope = (targets(STDDEV * noise + change) - targets(STDDEV * noise - change))[t] / 2e-5
         assert_allclose(found.first[0, t, 0], DISCOUNT**t * slope, rtol=1e-6)
+
+
+def test_what_is_infinite_in_a_state_stays_so():
+    """A memory may hold infinity, such as a best value so far."""
+    state = {"best": jnp.array([1.0, -jnp.inf])}
+    found, change = jax.jvp(lambda state: _faded(state, 0.6), (state,), (jax.tree.map(jnp.ones_like, state),))
+    assert_array_equal(found["best"], state["best"])
+    assert_allclose(change["best"][0], 0.6)
 
 
 class Spring(envs.Environment):
