@@ -42,6 +42,8 @@ class SlopeComparison(eqx.Module):
         slope_error: standard error of the slope. Conservative where many phases share a tooth, for their errors then cancel.
         mean: mean of each derivative over the interval, weighted like the slope.
         mean_error: standard error of the mean.
+        standard_error: standard error of `error`, the smaller of two that are too large rather than too small: both parts' own,
+            and that of what the derivative leaves of changes between neighbours, where curvature that both share does not count.
         spread: standard deviation of each derivative over the phases.
         num_teeth: half the number of crossings of the outcome with its trend: about the number of teeth in the interval.
         num_finite: number of phases with finite outcome and derivatives; only these count.
@@ -56,15 +58,11 @@ class SlopeComparison(eqx.Module):
     slope_error: Float[np.ndarray, "*outcome"]
     mean: Float[np.ndarray, "gradients *outcome"]
     mean_error: Float[np.ndarray, "gradients *outcome"]
+    standard_error: Float[np.ndarray, "gradients *outcome"]
     spread: Float[np.ndarray, "gradients *outcome"]
     num_teeth: Float[np.ndarray, "*outcome"]
     num_finite: Int[np.ndarray, "*outcome"]
     resolution: Float[np.ndarray, "*outcome"]
-
-    @property
-    def standard_error(self) -> Float[np.ndarray, "gradients *outcome"]:
-        """Standard error of `error`, both parts taken as independent: one concerns mainly jumps, the other flanks."""
-        return np.hypot(self.mean_error, self.slope_error)
 
     @property
     def error(self) -> Float[np.ndarray, "gradients *outcome"]:
@@ -156,7 +154,7 @@ def _column(u: np.ndarray, half: float, y: np.ndarray, slopes: Float[np.ndarray,
     is_finite = np.isfinite(y) & np.isfinite(slopes).all(axis=0)
     count = int(is_finite.sum())
     if count < _FEWEST_PHASES:
-        nothing = dict.fromkeys(("mean", "mean_error", "spread"), np.full(len(slopes), np.nan))
+        nothing = dict.fromkeys(("mean", "mean_error", "standard_error", "spread"), np.full(len(slopes), np.nan))
         nothing |= dict.fromkeys(("slope", "slope_error", "num_teeth"), np.nan)
         return {**nothing, "num_finite": count}
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
@@ -164,13 +162,20 @@ def _column(u: np.ndarray, half: float, y: np.ndarray, slopes: Float[np.ndarray,
     lever = _lever(u, weight) / half
     # A trend of degree 3, since curvature is no error of the slope.
     rest = _residuals(u, y, weight, 3)
-    kernel = weight**2 / (weight**2).sum()
+    # By parts, the slope is a mean of secants between neighbours; trapezoids of the same weights give the derivatives' mean.
+    between, middles = -np.cumsum(lever)[:-1] * half * np.diff(u), (u[1:] + u[:-1]) / 2
+    kernel = (np.append(between, 0) + np.append(0, between)) / 2
+    secants = np.diff(y) / (half * np.diff(u))
+    missed = [_residuals(middles, (one[1:] + one[:-1]) / 2 - secants, between, 1) for one in slopes]
+    slope_error = _clustered(lever * rest)
+    mean_error = np.array([_clustered(kernel * _residuals(u, one, kernel, 1)) for one in slopes])
     return {
         "slope": lever @ y,
-        "slope_error": _clustered(lever * rest),
+        "slope_error": slope_error,
         "num_teeth": np.count_nonzero(np.diff(np.signbit(rest))) / 2,
         "mean": slopes @ kernel,
-        "mean_error": np.array([_clustered(kernel * _residuals(u, one, weight**2, 1)) for one in slopes]),
+        "mean_error": mean_error,
+        "standard_error": np.fmin(np.hypot(mean_error, slope_error), [_clustered(between * one) for one in missed]),
         "spread": slopes.std(axis=1, ddof=1),
         "num_finite": count,
     }

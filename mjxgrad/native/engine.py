@@ -293,14 +293,10 @@ class _Linearisation:
         spanned = self._spanned(model, row, events := near.events)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
             return model, dataclasses.replace(near, events=None), nothing, row
-        least, surfaces = 4 * _WIDTH * np.abs(events.rows).max(axis=1), np.outer([0, 1, 2], events.centres)
-        off = events.gaps - surfaces
-        off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
-        shift = np.where(np.abs(off) < least, np.where(off < 0, -least, least) - off, 0.0)
-        clear = self._moved(model, row, events.moves @ shift)
+        clear = self._moved(model, row, events.clearance(_WIDTH))
         if self.surfaces.lead:
-            for move, width in zip(events.moves.T, least / 4, strict=True):
-                clear = self._off_stages(model, clear, width * move)
+            for move, rates in zip(events.moves.T, events.rows, strict=True):
+                clear = self._off_stages(model, clear, _WIDTH * np.abs(rates).max() * move)
         return model, near, spanned, clear
 
     def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -318,9 +314,8 @@ class _Linearisation:
     def _spanned(self, model: mujoco.MjModel, row: np.ndarray, events: Events) -> Float[np.ndarray, "size events"]:
         """Return D, the differences that span each event."""
         columns = []
-        middle = events.centres - events.gaps
-        for to, width, move in zip(middle, events.widths, events.moves.T, strict=True):
-            ends = [self._moved(model, row, (to + end) * move) for end in (width, -width)]
+        for middle, width, move in zip(events.middles.T, events.widths, events.moves.T, strict=True):
+            ends = [self._moved(model, row, middle + side * width * move) for side in (1, -1)]
             columns.append(self._difference(model, *ends) / (2 * width))
         return np.array(columns).T
 

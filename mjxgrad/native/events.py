@@ -13,14 +13,18 @@ q±_i is the present position moved along P_i until its gap is ±w_i. So D_i hol
 and each crossing of a surface is met by one step. A₀ serves all directions that leave the gaps of events as they are. It is a
 matrix of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
+- **Together.** The corners of a box that lands flat cross their surface in one step, and what each does depends on the others.
+  For contacts that share coordinates, i stands for the modes of their rows (left singular vectors; all gaps alike, then those
+  of tilt), each as large as moves one gap by 1, and q±_i lies about the position where all of their gaps are zero. Contacts that
+  do not act on each other have the same D either way. Modes that move something ten times as far as a gap are left to A₀. A
+  limit bounds one coordinate and stays an event of its own.
+
 - **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
   wider, holds all of them, with as much less weight; it moves with the velocity, too, so J stands for (J, hJ/2) there.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
-  Events that cannot be moved apart without moving something ten times as far (both feet of a robot that stands straight) are
-  moved together, as one.
 - **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.
   The lowest point of a standing cylinder, or a lying mesh, runs along its rim at tilts of the size of rounding.
   Small differences see that, and multiplied motions by 1e30 in fifty steps.
@@ -41,6 +45,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.sparse.csgraph import connected_components
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
 _HAIR = 6e-5  # m, over which the geometry of contacts is averaged
@@ -62,21 +67,33 @@ _Mask = Bool[np.ndarray, " rows"]
 
 @dataclass(frozen=True)
 class Events:
-    """Contacts and limits that a step may begin or end.
+    """Contacts and limits that a step may begin or end, by modes.
 
     Attributes:
-        rows: J, the rate of each gap by joint velocity.
-        gaps: distance less margin at present (m or rad).
-        centres: gap in the middle of what is spanned; zero, but for steps of several stages (m or rad).
+        rows: J, the rate of each mode by joint velocity.
+        moves: P, the displacement that changes one mode by one and leaves the others.
+        middles: the displacement to the middle of what is spanned, where the gaps of the mode's events are zero.
         widths: half of what is spanned (m or rad).
-        moves: P, the displacement that changes one gap by one and leaves the others.
+        surfaces: J of the events themselves.
+        gaps: their distances less margins at present (m or rad).
+        centres: their gaps in the middle; zero, but for steps of several stages (m or rad).
     """
 
-    rows: Float[np.ndarray, "events nv"]
+    rows: Float[np.ndarray, "modes nv"]
+    moves: Float[np.ndarray, "nv modes"]
+    middles: Float[np.ndarray, "nv modes"]
+    widths: Float[np.ndarray, " modes"]
+    surfaces: Float[np.ndarray, "events nv"]
     gaps: Float[np.ndarray, " events"]
     centres: Float[np.ndarray, " events"]
-    widths: Float[np.ndarray, " events"]
-    moves: Float[np.ndarray, "nv events"]
+
+    def clearance(self, change: float) -> Float[np.ndarray, " nv"]:
+        """Return the displacement after which changes of this size cross no surface of the events."""
+        least, stages = 4 * change * np.abs(self.surfaces).max(axis=1), np.outer([0, 1, 2], self.centres)
+        off = self.gaps - stages
+        off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
+        shift = np.where(np.abs(off) < least, np.where(off < 0, -least, least) - off, 0.0)
+        return np.linalg.lstsq(self.surfaces, shift, rcond=1e-3)[0]
 
 
 @dataclass(frozen=True)
@@ -146,7 +163,8 @@ class Surfaces:
         chosen = (np.abs(gaps - centres) < widths) & jumps
         events = None
         if chosen.any():
-            events = _moved_apart(rows / self.lengths, gaps, centres, widths, chosen, self.lengths)
+            is_contact = np.arange(len(rows)) < np.count_nonzero(np.asarray(data.contact.efc_address) >= 0)
+            events = _by_modes(rows, gaps, centres, widths, chosen, is_contact, self.lengths)
         others = jumps & ~chosen  # a force that begins without a jump may be crossed
         return Near(events, bool(is_rough.any()), bool(is_undecided.any()), rows[others], gaps[others], self.lengths)
 
@@ -217,32 +235,54 @@ def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
     return levers
 
 
-def _moved_apart(
-    scaled: _Rows, gaps: _PerRow, centres: _PerRow, widths: _PerRow, chosen: np.ndarray, lengths: np.ndarray
+def _by_modes(
+    rows: _Rows,
+    gaps: _PerRow,
+    centres: _PerRow,
+    widths: _PerRow,
+    chosen: _Mask,
+    is_contact: _Mask,
+    lengths: Float[np.ndarray, " nv"],
 ) -> Events | None:
-    """Return the chosen rows as events, with displacements that change one gap each and carry no other row across zero."""
-    index = np.flatnonzero(chosen)
-    apart = _independent(scaled[index], np.zeros((0, scaled.shape[1])))
-    if not apart:
+    """Return the chosen rows as events, with displacements that change one mode each and carry no other row across zero."""
+    scaled, index = rows / lengths, np.flatnonzero(chosen)
+    moved = ((rows != 0) & is_contact[:, None])[index].astype(float)
+    _, group = connected_components(moved @ moved.T, directed=False)
+    back, modes, values, widest, groups = (centres - gaps)[index], [], [], [], []
+    for one in range(group.max() + 1):
+        own = np.flatnonzero(group == one)
+        patterns, sizes, _ = np.linalg.svd(scaled[index[own]], full_matrices=False)
+        largest = np.abs(patterns).max(axis=0)
+        for weights in (largest * patterns).T[largest * sizes > 1 / _FARTHEST]:
+            modes.append(weights @ scaled[index[own]])
+            values.append(weights @ back[own])
+            widest.append(widths[index[own]].max())
+            groups.append(one)
+    if not modes:
         return None
-    # What cannot be told apart from another event goes with the one that it is most like.
-    unit = scaled[index[apart]] / np.linalg.norm(scaled[index[apart]], axis=1, keepdims=True)
-    group = np.argmax(np.abs(scaled[index] @ unit.T), axis=1)
-    group[apart] = np.arange(len(apart))
-    members = [index[group == i] for i in range(len(apart))]
-    rows = np.array([scaled[one].mean(axis=0) for one in members])
-    width = np.array([widths[one].max() for one in members])
-    gap, centre = gaps[index[apart]], centres[index[apart]]
+    apart = _independent(np.array(modes), np.zeros((0, scaled.shape[1])))
+    mode, label, width = (np.array(x)[apart] for x in (modes, groups, widest))
+    to_middle = np.where(label[:, None] == label, np.array(values)[apart, None], 0.0)
     held = np.zeros(0, int)
     while True:
-        kept = held[_independent(scaled[held], rows)]
-        moves = np.linalg.pinv(np.concatenate([rows, scaled[kept]]))[:, : len(rows)]
-        reach = np.max(np.abs(scaled @ moves) * (width + np.abs(gap - centre)), axis=1)
+        kept = held[_independent(scaled[held], mode)]
+        moves = np.linalg.pinv(np.concatenate([mode, scaled[kept]]))[:, : len(mode)]
+        middles = moves @ to_middle
+        reach = np.max(np.abs(scaled @ moves) * width + np.abs(scaled @ middles), axis=1)
         crossed = np.setdiff1d(np.flatnonzero((np.abs(gaps) < reach) & ~chosen), held)
         if not crossed.size:
             break
         held = np.concatenate([held, crossed])
-    return Events(rows * lengths, gap, centre, width, moves / lengths[:, None])
+    by_coordinate = 1 / lengths[:, None]
+    return Events(
+        mode * lengths,
+        moves * by_coordinate,
+        middles * by_coordinate,
+        width,
+        rows[index],
+        gaps[index],
+        centres[index],
+    )
 
 
 def _independent(rows: _Rows, others: Float[np.ndarray, "others nv"]) -> list[int]:

@@ -84,6 +84,15 @@ def test_neighbours_that_err_together_do_not_count_as_many():
     assert is_off.mean() < 0.15
 
 
+def test_curvature_that_outcome_and_derivative_share_is_no_error():
+    """Noise of 1 on a derivative that swings by 12: the bar is that of the noise, and covers it."""
+    x, rng = phases(INTERVAL, 64)[:, None], np.random.default_rng(2)
+    swing, noise = rng.uniform(0, 6, 2000), rng.normal(size=(64, 2000))
+    found = compare_to_slope(x[:, 0], np.sin(12 * x + swing), [12 * np.cos(12 * x + swing) + noise], ["noisy"])
+    assert 0.9 < np.sqrt((found.standard_error[0] ** 2).mean()) / found.error[0].std() < 1.1
+    assert (np.abs(found.error[0]) <= 2 * found.standard_error[0]).mean() > 0.88  # 16 blocks: t quantile 2.13, not 1.96
+
+
 def test_an_interval_within_one_tooth_is_not_resolved():
     """Two teeth cannot tell the trend from their flanks: errors of half the rise must not pass for a slope."""
     found = compare(lambda x: sawtooth(x, 0.26, 20.0), [lambda x: 3 * x**2 + 20])
