@@ -25,12 +25,11 @@ from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
 from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
-from mjxgrad.stepping import own_motion
 
 Method = Literal["onset", "discrete", "slope", "alpha", "inverse_variance", "zeroth", "ppo"]
 NAMES = {
-    "onset": "first order",
-    "discrete": "first order without an onset",
+    "onset": "first order with an onset",
+    "discrete": "first order",
     "slope": "first order by the slope",
     "alpha": "α-order",
     "inverse_variance": "weighed by variance",
@@ -75,11 +74,11 @@ class Settings(RunSettings):
     """By which contact is stiffer than in the scene."""
     num_substeps: Annotated[int, Field(ge=1)] | None = None
     """Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, quadruped and trot have their own."""
-    window: Annotated[int, Field(ge=1)] = 32
+    window: Annotated[int, Field(ge=1)] = learning.Settings.window
     """Steps of each environment per update."""
     actor_rate: Positive | None = None
     """Learning rate of the policy; if left out, the algorithm's."""
-    critic_rate: Positive = 2e-3
+    critic_rate: Positive = learning.Settings.critic_rate
     """Learning rate of the value function."""
     trace: Annotated[float, Field(ge=0, le=1)] = learning.Settings.trace
     """λ of the returns that a policy climbs; below 1 derivatives reach less far."""
@@ -321,8 +320,8 @@ def _every(settings: Settings) -> int:
 
 
 def _stepped(environment: Environment, method: Method) -> Environment:
-    """Return the environment whose motion and derivative are the method's; those not named after one have an onset."""
-    return environment.with_contact(own_motion(method) if method in ("discrete", "slope") else mg.Onset())
+    """Return the environment whose motion and derivative are the method's: MuJoCo's, but for those named after another."""
+    return environment.with_contact({"onset": mg.Onset(), "slope": mg.Slope()}.get(method, mg.Discrete()))
 
 
 def _stiffer(environment: Environment, factor: float) -> mg.Softness:

@@ -182,7 +182,8 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
             found = compare_to_slope(places, outcomes, [gradients], ("slope",))
             shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()} | {"starts": count}
             shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
-    is_wild = shown["steps"] == "consistent" and shown["spread"] > _WILD * max(abs(shown["slope"]), shown["resolution"])
+    is_wild = shown["steps"] in ("consistent", "ill-defined")
+    is_wild &= shown["spread"] > _WILD * max(abs(shown["slope"]), shown["resolution"])
     if shown["steps"] == "off" or shown["lost"] or is_wild:
         outcomes, flags, gradients = _along(model, scene, phases(_INTERVAL, _PHASES[0]), measure_growth=True)
         shown["lost"] = int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients) & ~flags))

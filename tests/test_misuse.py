@@ -317,7 +317,8 @@ FOUND = {
     "mg.learning.Settings(window=0)": "window must be at least 1, got 0",
     "mg.learning.Settings(discount=1.5)": "discount must be from 0 to 1, got 1.5",
     "mg.learning.Settings(stddev=(0.1, 0.0))": "stddev must be positive",
-    "mg.learning.Settings(critic_batches=5)": "critic_batches must divide the 2048 states of an update, got 5",
+    "mg.learning.Settings(critic_batches=5)": "critic_batches must divide the 1024 states of an update, got 5",
+    "mg.learning.Settings(has_critic=False)": "trace must be 1 without a value function, got 0.9",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",

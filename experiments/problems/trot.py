@@ -161,6 +161,7 @@ def apg(**changes: Any) -> learning.Settings:
     """
     settings = {
         "discount": 1.0,
+        "trace": 1.0,
         "rule": FixedAlpha(1.0),
         "stddev": (0.07, 0.01),
         "actor_layers": (256, 128),

@@ -5,12 +5,12 @@ fits the value function to TD($\lambda$) targets. The methods differ only in the
 
 | `rule` | method |
 |---|---|
-| `rules.FixedAlpha(1)` | first order: SHAC |
+| `rules.FixedAlpha(1)` | first order: SHAC, with the blended adjoint of `window` |
 | `rules.FixedAlpha(0)` | zeroth order: REINFORCE with a value function |
 | `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
 | `rules.Consistent(failure_probability=1e-3)` | the same with a test for bias: α-order, the default |
 
-Without a value function (`has_critic=False`) first order is analytic policy gradients (APG).
+Without a value function (`has_critic=False, trace=1.0`) first order is analytic policy gradients (APG).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.

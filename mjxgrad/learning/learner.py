@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.learning.networks import FINAL_SCALE, Network, Normaliser
+from mjxgrad.learning.networks import FINAL_SCALE, Network, Normaliser, ValueFunction
 from mjxgrad.learning.settings import Settings
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, window_gradients
 from mjxgrad.loop.run import Method
@@ -59,8 +59,8 @@ class Learner(eqx.Module):
     """
 
     policy: Policy
-    critic: Network
-    target: Network
+    critic: ValueFunction
+    target: ValueFunction
     actor_moments: optax.OptState
     critic_moments: optax.OptState
     environments: EnvState
@@ -97,16 +97,16 @@ class ActorCritic(Method):
         # Actions before squashing, near zero at first.
         sizes = num_seen, *settings.actor_layers, num_actions
         actor = Network.make(sizes, actor_key, hidden_scale=settings.actor_scale, final_scale=FINAL_SCALE)
-        # No value function is a network that is zero and is never fitted.
-        sizes = num_seen, *settings.critic_layers, 1
-        critic = Network.make(sizes, critic_key, final_scale=float(settings.has_critic))
+        critic = ValueFunction.make((num_seen, *settings.critic_layers, 1), critic_key)
+        if not settings.has_critic:  # one that is zero, and is never fitted
+            critic = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, critic)
         actor_optimiser, critic_optimiser = optimisers(settings, self.num_updates)
         return Learner(
             policy=Policy(actor, Normaliser.make(num_seen).with_more(environments.obs)),
             critic=critic,
             target=critic,
             actor_moments=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
-            critic_moments=critic_optimiser.init(eqx.filter(critic, eqx.is_array)),
+            critic_moments=critic_optimiser.init(eqx.filter(critic.network, eqx.is_array)),
             environments=environments,
             model_keys=model_keys,
             episode_return=jnp.zeros(count),
@@ -125,8 +125,7 @@ class ActorCritic(Method):
         critic, target, critic_moments = learner.critic, learner.target, learner.critic_moments
         critic_loss = jnp.zeros(())
         if settings.has_critic:
-            critic, critic_moments, critic_loss = self._fit_critic(learner, window, critic_key)
-            target = jax.tree.map(lambda old, new: old + _TARGET_RATE * (new - old), learner.target, critic)
+            critic, target, critic_moments, critic_loss = self._fit_critic(learner, window, critic_key)
         episode_return, ended = _episodes(window, learner.episode_return)
         following = dataclasses.replace(
             learner,
@@ -169,7 +168,14 @@ class ActorCritic(Method):
             own = eqx.combine(arrays, structure)
             networks = (policy.actor, critic, policy.normaliser)
             return window_gradients(
-                own, state, model_key, noise, *networks, stddev, self.settings.discount, self.settings.trace
+                own,
+                state,
+                model_key,
+                noise,
+                *networks,
+                stddev,
+                self.settings.discount,
+                self.settings.trace,
             )
 
         # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
@@ -216,33 +222,36 @@ class ActorCritic(Method):
 
     def _fit_critic(
         self, learner: Learner, window: Window, key: PRNGKeyArray
-    ) -> tuple[Network, optax.OptState, Float[Array, ""]]:
-        """Return the value function fitted to the window's targets, its optimiser's state and the last pass's loss."""
+    ) -> tuple[ValueFunction, ValueFunction, optax.OptState, Float[Array, ""]]:
+        """Return value function and target fitted to the window's returns, the optimiser's state and the last pass's loss."""
         normaliser = learner.policy.normaliser
 
         def targets(window: Window) -> Float[Array, " steps"]:
             return lambda_returns(
-                window, lambda obs: learner.target(normaliser(obs))[0], self.settings.discount, _CRITIC_TRACE
+                window, lambda obs: learner.target(normaliser(obs)), self.settings.discount, _CRITIC_TRACE
             )
 
         wanted = jax.vmap(targets)(window).reshape(-1)
-        seen = jax.vmap(normaliser)(window.obs.reshape(len(wanted), -1))
+        critic, target = learner.critic.with_more(wanted), learner.target.with_more(wanted)
+        seen = normaliser(window.obs.reshape(len(wanted), -1))
         _, optimiser = optimisers(self.settings, self.num_updates)
 
-        def loss(critic: Network, seen: Array, wanted: Array) -> Float[Array, ""]:
-            return ((jax.vmap(critic)(seen)[:, 0] - wanted) ** 2).mean()
+        def loss(network: Network, seen: Array, wanted: Array) -> Float[Array, ""]:
+            return ValueFunction(network, critic.moments).loss(seen, wanted)
 
         def fit(carry: tuple[Network, optax.OptState], rows: Array):
-            critic, moments = carry
-            value, gradient = jax.value_and_grad(loss)(critic, seen[rows], wanted[rows])
-            return _stepped(optimiser, gradient, moments, critic), value
+            network, moments = carry
+            value, gradient = jax.value_and_grad(loss)(network, seen[rows], wanted[rows])
+            return _stepped(optimiser, gradient, moments, network), value
 
         orders = jax.vmap(lambda k: jax.random.permutation(k, len(wanted)))(
             jax.random.split(key, self.settings.critic_iterations)
         )
         rows = orders.reshape(self.settings.critic_iterations * self.settings.critic_batches, -1)
-        (critic, moments), losses = jax.lax.scan(fit, (learner.critic, learner.critic_moments), rows)
-        return critic, moments, losses[-self.settings.critic_batches :].mean()
+        (network, moments), losses = jax.lax.scan(fit, (critic.network, learner.critic_moments), rows)
+        critic = ValueFunction(network, critic.moments)
+        target = jax.tree.map(lambda old, new: old + _TARGET_RATE * (new - old), target, critic)
+        return critic, target, moments, losses[-self.settings.critic_batches :].mean()
 
 
 def optimisers(

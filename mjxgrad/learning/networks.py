@@ -1,4 +1,4 @@
-"""Networks with layer normalisation, and running moments of observations."""
+"""Networks with layer normalisation, running moments, and a value function in units of its targets."""
 
 from collections.abc import Sequence
 
@@ -57,10 +57,14 @@ class Normaliser(eqx.Module):
         """Return the normalisation without observations, the identity."""
         return cls(jnp.zeros(()), jnp.zeros(size), jnp.zeros(size))
 
-    def __call__(self, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+    def __call__(self, obs: Float[Array, "*rows obs"]) -> Float[Array, "*rows obs"]:
+        return (obs - self.mean) / self.scale
+
+    @property
+    def scale(self) -> Float[Array, " obs"]:
+        """Standard deviations; 1 for a number that never changes."""
         variance = jnp.where(self.count > 1, self.squares / jnp.maximum(self.count, 1), 1.0)
-        # A number that never changes is not scaled.
-        return (obs - self.mean) / jnp.where(variance > 1e-8, jnp.sqrt(variance), 1.0)
+        return jnp.where(variance > 1e-8, jnp.sqrt(variance), 1.0)
 
     def with_more(self, obs: Float[Array, "*batch obs"]) -> "Normaliser":
         """Return the normalisation with more observations; those that are not finite are left out."""
@@ -73,3 +77,41 @@ class Normaliser(eqx.Module):
         count, shift = self.count + added, mean - self.mean
         share = added / jnp.maximum(count, 1)
         return Normaliser(count, self.mean + share * shift, self.squares + squares + shift**2 * self.count * share)
+
+
+class ValueFunction(eqx.Module):
+    """A value function: a network whose output is in units of the returns seen so far, about their mean.
+
+    Rewards of any size are then fitted at one learning rate.
+
+    References:
+        van Hasselt, Guez, Hessel, Mnih, Silver. Learning values across many orders of magnitude. NeurIPS 2016,
+        arXiv:1602.07714 (Pop-Art).
+    """
+
+    network: Network
+    moments: Normaliser
+
+    @classmethod
+    def make(cls, sizes: Sequence[int], key: PRNGKeyArray) -> "ValueFunction":
+        """Draw a value function that is near zero; `sizes` as for `Network.make`, with one output."""
+        return cls(Network.make(sizes, key, final_scale=FINAL_SCALE), Normaliser.make(1))
+
+    def __call__(self, obs: Float[Array, " obs"]) -> Float[Array, ""]:
+        """Return the value of a normalised observation."""
+        return (self.moments.mean + self.moments.scale * self.network(obs))[0]
+
+    def loss(self, obs: Float[Array, "rows obs"], targets: Float[Array, " rows"]) -> Float[Array, ""]:
+        """Return the mean squared error over the variance of returns."""
+        return ((jax.vmap(self.network)(obs)[:, 0] - self.moments(targets[:, None])[:, 0]) ** 2).mean()
+
+    def with_more(self, targets: Float[Array, "*batch"]) -> "ValueFunction":
+        """Return the same function in units that take more returns into account."""
+        moments = self.moments.with_more(targets[..., None])
+        last, share = self.network.layers[-1], self.moments.scale / moments.scale
+        shift = (self.moments.mean - moments.mean) / moments.scale
+        changed = jax.tree.map(lambda x: (share * x.T).T, last)
+        network = eqx.tree_at(
+            lambda n: n.layers[-1], self.network, eqx.tree_at(lambda n: n.bias, changed, changed.bias + shift)
+        )
+        return ValueFunction(network, moments)

@@ -177,7 +177,7 @@ def window_gradients(
     model_key: PRNGKeyArray,
     noise: Float[Array, "steps nu"],
     actor: Network,
-    critic: Network,
+    critic: Value,
     normaliser: Normaliser,
     stddev: Float[Array, ""],
     discount: float,
@@ -191,7 +191,7 @@ def window_gradients(
     copy = environment.randomised(model_key)
 
     def value(obs: Float[Array, " obs"]) -> Float[Array, ""]:
-        return critic(normaliser(obs))[0]
+        return critic(normaliser(obs))
 
     def gain(change: Float[Array, "steps nu"]):
         window, final = run_window(copy, state, actor, normaliser, stddev * noise + change, trace)

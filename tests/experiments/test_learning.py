@@ -15,7 +15,7 @@ from experiments.workspace import Workspace
 QUICK = Settings(
     experiment="learning",
     environment="cartpole",
-    methods=("onset", "zeroth"),
+    methods=("discrete", "zeroth"),
     size="quick",
     sizes=Sizes(num_seeds=2, num_updates=4, num_environments=2, num_episodes=2),
     num_substeps=None,
@@ -41,19 +41,19 @@ def course(method, returns, **history):
 
 
 def test_the_verdict_names_the_best_in_mujoco():
-    """Means over episodes 3 and 5, so 4 ± √2 over seeds; 256 steps are 4 updates of 2 environments of 32."""
-    outcome = Outcome(QUICK, [course("zeroth", [[1, 1], [1, 1]]), course("onset", [[2, 4], [4, 6]])], None)
-    assert verdict(outcome) == "After 256 steps first order returns 4.0 ± 1.4 in C MuJoCo; zeroth order 1.00."
+    """Means over episodes 3 and 5, so 4 ± √2 over seeds; 256 steps are 4 updates of 2 environments of 16."""
+    outcome = Outcome(QUICK, [course("zeroth", [[1, 1], [1, 1]]), course("discrete", [[2, 4], [4, 6]])], None)
+    assert verdict(outcome) == "After 128 steps first order returns 4.0 ± 1.4 in C MuJoCo; zeroth order 1.00."
 
 
 def test_what_was_left_out_is_said():
     """A share of a quarter in the last of four updates of both seeds."""
-    lost = course("onset", [[1, 1], [1, 1]], not_finite=[[0, 0], [0, 0], [0, 0], [0.25, 0.25]], skipped=np.eye(4, 2))
+    lost = course("discrete", [[1, 1], [1, 1]], not_finite=[[0, 0], [0, 0], [0, 0], [0.25, 0.25]], skipped=np.eye(4, 2))
     sentences = findings(Outcome(QUICK, [lost], None))
     assert sentences[0] == (
         "First order: 6.2% of the derivatives were no numbers, 0 steps diverged, 2 updates were skipped."
     )
-    assert findings(Outcome(QUICK, [course("onset", [[1, 1], [1, 1]])], None))[0].startswith(
+    assert findings(Outcome(QUICK, [course("discrete", [[1, 1], [1, 1]])], None))[0].startswith(
         "Every derivative was a number"
     )
 
@@ -61,20 +61,20 @@ def test_what_was_left_out_is_said():
 def test_what_was_shortened_is_said_once_of_all():
     """A quarter of the values is one half: an eighth. Zeroth order has no derivatives to shorten."""
     shortened = np.repeat([[0.5], [0], [0], [0]], 2, axis=1)
-    courses = [course(method, [[1, 1]] * 2, shortened=shortened) for method in ("onset", "alpha", "zeroth")]
+    courses = [course(method, [[1, 1]] * 2, shortened=shortened) for method in ("discrete", "alpha", "zeroth")]
     assert findings(Outcome(QUICK, courses, None))[0] == (
-        "Derivatives longer than 0.3 times zeroth-order noise were shortened to that: 12% (first order) and 12% (α-order)."
+        "Derivatives longer than 0.1 times zeroth-order noise were shortened to that: 12% (first order) and 12% (α-order)."
     )
 
 
 def test_a_reward_that_falls_again_is_not_the_soonest():
     """Means over the updates so far: 0, 1, 2/3 and 1/2 against 0, 3/2, -1 and -3/4; half of the way is 1/4."""
-    rewards = {"onset": [0, 2, 0, 0], "zeroth": [0, 3, -6, 0]}
+    rewards = {"discrete": [0, 2, 0, 0], "zeroth": [0, 3, -6, 0]}
     courses = [course(name, [[1, 1]] * 2, reward=np.repeat([r], 2, axis=0).T) for name, r in rewards.items()]
-    assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["onset"]
+    assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["discrete"]
 
 
-COMMAND = ["run", "learn_cartpole", 'size="quick"', "sizes.num_updates=2", 'methods=["onset"]', "precision=float64"]
+COMMAND = ["run", "learn_cartpole", 'size="quick"', "sizes.num_updates=2", 'methods=["discrete"]', "precision=float64"]
 
 
 def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
@@ -90,4 +90,4 @@ def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("brax") is not None, reason="brax is installed")
 def test_without_brax_ppo_is_refused_before_the_others_learn(tmp_path):
     with pytest.raises(ExperimentError, match=r"pip install 'mjxgrad\[playground\]'"):
-        measure(QUICK.model_copy(update={"methods": ("onset", "ppo")}), Workspace(tmp_path))
+        measure(QUICK.model_copy(update={"methods": ("discrete", "ppo")}), Workspace(tmp_path))

@@ -177,7 +177,7 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     """The gradient of one update against that of a plain sum over windows, and of both halves; with hardly any noise."""
     settings = learning.Settings(
         num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf,
-        discount=1.0, rule=FixedAlpha(1.0), has_critic=False,
+        discount=1.0, trace=1.0, rule=FixedAlpha(1.0), has_critic=False,
     )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
     before = ActorCritic(cartpole, settings, 1).init(key)
@@ -200,7 +200,7 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     assert_allclose(run.history["agreement"][0], cosine, rtol=1e-6)
     # Windows follow one another, and nothing is fitted.
     assert run.learner.environments.num_steps.max() > 3
-    assert all(not x.any() for x in jax.tree.leaves(run.learner.critic.layers[-1]))
+    assert all(not x.any() for x in jax.tree.leaves(run.learner.critic.network.layers[-1]))
 
 
 def test_gradients_are_clipped_by_their_norm():

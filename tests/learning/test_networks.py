@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.testing import assert_allclose
 
-from mjxgrad.learning.networks import Network, Normaliser
+from mjxgrad.learning.networks import Network, Normaliser, ValueFunction
 
 
 def test_moments_are_those_of_all_batches_together(key):
@@ -52,3 +52,23 @@ def test_only_hidden_layers_are_scaled(key):
         assert_allclose(other.weight, 0.01 * layer.weight)
         assert_allclose(other.bias, 0.01 * layer.bias)
     assert_allclose(scaled.layers[-1].weight, plain.layers[-1].weight)
+
+
+def test_a_value_function_keeps_its_values_when_its_units_change(key):
+    obs, (before, after) = jax.random.normal(key, (50, 3)), 400 + 90 * jax.random.normal(key, (2, 50))
+    value = ValueFunction.make((3, 8, 1), key).with_more(before)
+    changed = value.with_more(3 * after)
+    assert_allclose(jax.vmap(changed)(obs), jax.vmap(value)(obs), rtol=1e-10)
+    assert changed.moments.scale[0] > 3 * value.moments.scale[0]
+
+
+def test_rewards_of_any_size_are_fitted_alike(key):
+    """The loss has the same gradient for returns a thousand times as large, but for the first values, 1e-4 of the small ones."""
+    obs, returns = jax.random.normal(key, (50, 3)), 400 + 90 * jax.random.normal(key, (50,))
+
+    def slope(size):
+        value = ValueFunction.make((3, 8, 1), key).with_more(size * returns)
+        loss = jax.grad(lambda network: ValueFunction(network, value.moments).loss(obs, size * returns))
+        return loss(value.network).layers[1].weight
+
+    assert_allclose(slope(1.0), slope(1000.0), rtol=1e-3)

@@ -89,7 +89,11 @@ def networks():
     actor = Network.make((5, 6, 1), actor_key, final_scale=0.01)
     actor = eqx.tree_at(lambda a: a.layers[-1].weight, actor, 50 * actor.layers[-1].weight)
     critic = Network.make((5, 6, 1), critic_key, final_scale=5.0)
-    return actor, critic, Normaliser.make(5).with_more(jax.random.normal(jax.random.key(4), (20, 5)))
+    return (
+        actor,
+        lambda obs: critic(obs)[0],
+        Normaliser.make(5).with_more(jax.random.normal(jax.random.key(4), (20, 5))),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +122,7 @@ def gradients_at(cartpole, networks):
 def gain(cartpole, networks, state, added):
     actor, critic, normaliser = networks
     window, _ = run_window(cartpole, state, actor, normaliser, added)
-    return returned(window, lambda obs: critic(normaliser(obs))[0], DISCOUNT)
+    return returned(window, lambda obs: critic(normaliser(obs)), DISCOUNT)
 
 
 def test_the_first_order_gradient_is_the_slope_of_the_return(cartpole, networks, gradients_at, key):
@@ -147,7 +151,7 @@ def test_the_blended_gradient_is_the_slope_of_each_step_s_lambda_return(cartpole
     @jax.jit
     def targets(added):
         window, _ = run_window(cartpole, start, actor, normaliser, added)
-        return lambda_returns(window, lambda obs: critic(normaliser(obs))[0], DISCOUNT, trace)
+        return lambda_returns(window, lambda obs: critic(normaliser(obs)), DISCOUNT, trace)
 
     for t in range(STEPS):
         change = jnp.zeros_like(noise).at[t].set(1e-5)
@@ -203,7 +207,11 @@ def test_with_the_exact_value_function_the_trace_changes_no_mean():
             state = environment.reset(jax.random.key(0))
             state = dataclasses.replace(state, physics=mg.initial_state(scene, jnp.array([0.5]), jnp.array([1.0])))
             state = dataclasses.replace(state, obs=environment.observe(state.physics, None))
-            networks = (Quadratic((), (), jnp.zeros((2, 2))), Quadratic((), (), P), Normaliser.make(2))
+            networks = (
+                Quadratic((), (), jnp.zeros((2, 2))),
+                lambda obs: Quadratic((), (), P)(obs)[0],
+                Normaliser.make(2),
+            )
             return window_gradients(
                 environment, state, jax.random.key(0), noise, *networks, jnp.asarray(STDDEV), DISCOUNT, trace
             )[2]
