@@ -11,7 +11,7 @@ import mjxgrad
 ROOT = Path(mjxgrad.__file__).parent
 # Each line may import those above it; parts of one line do not know each other.
 ORDER = (
-    ("_arrays", "_mjx", "_programs", "_text", "report"),
+    ("_arrays", "_mjx", "_programs", "_text", "_warnings", "report"),
     ("batched",),
     ("bodies",),
     ("contact", "solver"),

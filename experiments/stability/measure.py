@@ -29,6 +29,7 @@ from experiments.stability.scenes import (
 from experiments.stability.settings import Settings
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
+from mjxgrad._warnings import collected
 
 C_MUJOCO = "C MuJoCo"
 NOT_ASKED = -1
@@ -280,18 +281,14 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Run every scene in every precision, and C MuJoCo beside it, some scenes at a time: most of it is compilation."""
     size = settings.sizes
     scenes = [scene for scene in catalogue() if size.scenes is None or scene.name in size.scenes]
-    # A simulation that goes wrong is what is looked for; C MuJoCo would write a file about it.
-    mujoco.set_mju_user_warning(lambda _: None)
 
     def run(scene: StabilityScene) -> SceneOutcome:
         case = _Case(scene, points(scene, size.resolution, size.num_random, settings.seed), settings)
         return SceneOutcome(scene, case.grid, workspace.once(scene.name, lambda: _found(case)))
 
-    try:
-        with workspace.stage("simulating", "scenes", len(scenes)) as advance_to:
-            return Outcome(settings, in_threads(run, scenes, advance_to))
-    finally:
-        mujoco.set_mju_user_warning(None)
+    # A simulation that goes wrong is what is looked for; C MuJoCo would write a file about it.
+    with collected(), workspace.stage("simulating", "scenes", len(scenes)) as advance_to:
+        return Outcome(settings, in_threads(run, scenes, advance_to))
 
 
 def _found(case: _Case) -> xr.Dataset:

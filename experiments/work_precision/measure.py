@@ -5,12 +5,11 @@ rollouts are simulated once for each time step and derivative; the library's own
 records.
 """
 
-import contextlib
 import copy
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -32,6 +31,7 @@ from experiments.work_precision.cases import Case, case, own_case
 from experiments.work_precision.settings import Settings, Sizes
 from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
+from mjxgrad._warnings import collected
 from mjxgrad.objective import Differentiated, Objective
 
 C, MG, MJX, ONSET = "C MuJoCo", "mg.step", "mjx.step", "mg.step, onset"
@@ -273,7 +273,7 @@ class Native:
         velocities = slice(1 + model.nq, 1 + model.nq + model.nv)
         initial[:, 1 : 1 + model.nq], initial[:, velocities] = case.start[0], qvel
         workers, seconds, finals = [mujoco.MjData(model) for _ in range(num_cores())], 0.0, []
-        with _unsaid(), mujoco.rollout.Rollout(nthread=len(workers) if len(workers) > 1 else 0) as pool:
+        with collected(), mujoco.rollout.Rollout(nthread=len(workers) if len(workers) > 1 else 0) as pool:
             for part in np.array_split(initial, -(-batch // _AT_A_TIME)):
                 control = np.tile(case.controls, (len(part), num_steps, 1)) if model.nu else None
                 begun = time.perf_counter()
@@ -289,16 +289,6 @@ def _c_model(case: Case, variant: Variant) -> mujoco.MjModel:
     model.opt.integrator, model.opt.solver = _INTEGRATORS[variant.integrator], mujoco.mjtSolver.mjSOL_NEWTON
     model.opt.iterations = 100  # enough to converge
     return model
-
-
-@contextlib.contextmanager
-def _unsaid() -> Iterator[None]:
-    """Keep C MuJoCo from writing a warning, to the terminal and to a file, for each state that diverges: the error says it."""
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(None)
 
 
 def repeated(

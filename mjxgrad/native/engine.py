@@ -14,6 +14,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
+from mjxgrad._warnings import collected
 from mjxgrad.native.events import Events, Near, Surfaces, levers_of, undecided
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
@@ -56,7 +57,7 @@ class Engine:
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
         """Return positions, velocities and activations after each step."""
-        with self.lock, _quietly():
+        with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
             rows = self._rows(start)
             full, user = (self._part(rows, spec) for spec in (_FULL, _USER))
@@ -79,7 +80,7 @@ class Engine:
 
         States before each step are in `start`, with an axis of steps as inputs have it.
         """
-        with self.lock, _quietly():
+        with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 2, numbers, start, inputs)
             steps = inputs["ctrl"].shape[1]
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
@@ -108,7 +109,7 @@ class Engine:
 
         Changes are in tangent space; along one direction a step takes two differences in place of one for each coordinate.
         """
-        with self.lock, _quietly():
+        with self.lock, collected():
             _, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
             num_steps, model = inputs["ctrl"].shape[1], self.mj_model
             sizes = {"qpos": model.nq, "qvel": model.nv, "act": model.na, "change": 2 * model.nv + model.na}
@@ -399,13 +400,3 @@ def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarr
     positions = np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, positions, 1.0, below[0], above[0])
     return np.concatenate([positions, above[1] - below[1], above[2] - below[2]])
-
-
-class _quietly:  # noqa: N801 - a context, used as a word
-    """Numbers that are not finite are seen in the result; MuJoCo would write them into a file."""
-
-    def __enter__(self) -> None:
-        mujoco.set_mju_user_warning(lambda _: None)
-
-    def __exit__(self, *_) -> None:
-        mujoco.set_mju_user_warning(None)

@@ -14,11 +14,9 @@ and each crossing of a surface is met by one step. A₀ serves all directions th
 matrix of rank one per event, as saltation matrices are, so an event costs two more steps, and a step without any costs nothing.
 
 - **Together.** The corners of a box that lands flat cross their surface in one step, and what each does depends on the others.
-  For contacts that share coordinates, i stands for the modes of their rows (left singular vectors; all gaps alike, then those
-  of tilt), each as large as moves one gap by 1, and q±_i lies about the position where all of their gaps are zero. Contacts that
-  do not act on each other have the same D either way. Modes that move something ten times as far as a gap are left to A₀. A
-  limit bounds one coordinate and stays an event of its own.
-
+  Contacts that share coordinates are therefore taken by modes, the left singular vectors of their rows: all gaps alike, then
+  tilts. A mode is as large as moves one gap by 1, and q± lies about the position where all of their gaps are zero. Modes that
+  move something ten times as far as a gap are left to A₀. A limit bounds one coordinate and stays an event of its own.
 - **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
   wider, holds all of them, with as much less weight; it moves with the velocity, too, so J stands for (J, hJ/2) there.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the

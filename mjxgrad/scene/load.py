@@ -1,13 +1,10 @@
 """Loading of scenes from a file, a string or a C model."""
 
-import contextlib
 import copy
 import itertools
 import math
 import os
-import threading
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -18,6 +15,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
+from mjxgrad._warnings import collected
 from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
@@ -36,7 +34,6 @@ from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 _FLOAT32_TOLERANCE = 1e-6
 MOST_PAIRS = 20_000
 """Largest number of geom pairs; loading more takes minutes and is refused."""
-_LISTENING = threading.Lock()  # all threads share one handler of warnings
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -83,7 +80,7 @@ def load_scene(
         raise ValueError(f"softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got {softness!r}")
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
-    with _listening() as told:
+    with collected() as told:
         mj_model, name = _compile(source)
     _set_timestep(mj_model, name, timestep)
     _check_model(mj_model, name)
@@ -110,19 +107,6 @@ def load_scene(
     for message in messages + scene.warnings():
         warnings.warn(f"{name}: {message}", SceneWarning, stacklevel=2)
     return scene
-
-
-@contextlib.contextmanager
-def _listening() -> Iterator[list[str]]:
-    """Collect the warnings that MuJoCo would write to the terminal and to a file in the current folder."""
-    told: list[str] = []
-    with _LISTENING:
-        former = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(told.append)
-        try:
-            yield told
-        finally:
-            mujoco.set_mju_user_warning(former)
 
 
 def _compile(source: str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel) -> tuple[mujoco.MjModel, str]:

@@ -1,5 +1,7 @@
 """C MuJoCo behind `rollout`: the same motion, mapped over starts, controls and softness; what it cannot do is refused."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad._warnings import collected
 from mjxgrad.tasks import scene_path
 
 HORIZON = 40
@@ -120,3 +123,22 @@ def test_softness_acts_on_a_scene_that_mjx_lacks():
         mujoco.mj_step(model, data)
         np.testing.assert_allclose(qpos, data.qpos, atol=1e-9)
     assert np.abs(data.qpos - mg.rollout(scene, mg.initial_state(scene), horizon=40).qpos[-1]).max() > 1e-4
+
+
+def test_warnings_are_heard_by_the_thread_that_caused_them_until_it_has_done():
+    """MuJoCo has one handler for all: without it a warning is written to a file, or calls nothing at all."""
+    model, former = mujoco.MjModel.from_xml_path(str(scene_path("servo_arm"))), mujoco.get_mju_user_warning()
+
+    def diverge():
+        data = mujoco.MjData(model)
+        data.qvel[0] = np.nan
+        mujoco.mj_step(model, data)
+
+    with ThreadPoolExecutor(1) as other, collected() as mine:
+        with collected() as inner:
+            other.submit(diverge).result()
+            assert not mine
+            assert not inner
+        diverge()
+        assert len(mine) == 1
+    assert mujoco.get_mju_user_warning() is former
