@@ -101,4 +101,4 @@ def gallery(summaries: Mapping[str, dict[str, Any]]) -> str:
         | {kind: one[kind] and f"{folder}/{one[kind]}" for kind in ("figure", "video")}
         for folder, one in summaries.items()
     ]
-    return pages.page("Experiments and what they answer", f"{len(cards)} results", (), cards)
+    return pages.page("Experiments and what they answer", f"{len(cards)} result{'s' * (len(cards) != 1)}", (), cards)
