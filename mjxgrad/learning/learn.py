@@ -94,9 +94,9 @@ def learn(
             raise ValueError(f"{name} must be at least 1, got {number}")
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.wrap_key_data(key)
-    environments = [environment] if isinstance(environment, Environment) else list(environment)
-    if not environments:
-        raise ValueError("environment must be one or several, got an empty sequence")
+    environments = [environment] if not isinstance(environment, Sequence) else list(environment)
+    if not environments or not all(isinstance(one, Environment) for one in environments):
+        raise ValueError(f"environment must be one mg.envs.Environment or several, got {environment!r:.80}")
     method, axes = side_by_side([ActorCritic(one, settings, num_updates) for one in environments])
     shape, over = key.shape, [None] * key.ndim
     if not isinstance(environment, Environment):
