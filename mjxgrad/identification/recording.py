@@ -222,14 +222,9 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
 def simulated(
     scene: Scene, window: Windows, offset: Float[Array, " both"] | None, delay: Float[Array, ""] | None, **settings: Any
 ) -> tuple[dict[str, Array], Bool[Array, ""]]:
-    """Return all signals of a simulation by name, at the scene's own steps, and whether the motion diverged; traceable.
+    """Return all signals of a simulated window by name, at the scene's own steps, and whether it diverged; traceable.
 
-    Args:
-        scene: the scene with the present parameters.
-        window: one window, without the leading axis.
-        offset: change of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
-        delay: delay of the controls beyond the recorded times (s); None for none.
-        **settings: as in `rollout`.
+    The offset changes the start, positions and velocities (m, rad, m/s, rad/s). The delay (s) is of the controls.
     """
     model, state, controls = scene.model, window.state, window.controls
     if offset is not None:
@@ -255,15 +250,7 @@ def residuals(
     *,
     contact: Contact,
 ) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
-    """Return the simulated less the measured signals of one window, in units of the noise, and whether the motion diverged.
-
-    Args:
-        scene: the scene with the present parameters.
-        window: one window, without the leading axis.
-        offset: as in `simulated`.
-        delay: as in `simulated`.
-        contact: as in `rollout`.
-    """
+    """Return the `simulated` less the measured signals of one window, in units of the noise, and whether it diverged."""
     found, diverged = simulated(scene, window, offset, delay, contact=contact)
     parts = []
     for name, measured in window.measured.items():
