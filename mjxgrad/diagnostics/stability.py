@@ -122,16 +122,15 @@ class Spring:
     @property
     def num_steps(self) -> float:
         """Number of time steps in a single bounce, at any speed; infinite without stiffness."""
-        if self.stiffness <= 0 or self.damping <= 0:
-            return np.pi / np.sqrt(self.stiffness) / self.timestep if self.stiffness > 0 else np.inf
-        return 2 * bounce_angle(self.damping_ratio) / np.sqrt(self.stiffness) / self.timestep
+        if self.stiffness <= 0:
+            return np.inf
+        return 2 * bounce_angle(max(self.damping_ratio, 0.0)) / np.sqrt(self.stiffness) / self.timestep
 
     def depth(self, speed: float) -> float:
         r"""Return the depth in m of a bounce at a speed of approach, $v \sqrt e / \omega_0$, restitution $e$."""
         if self.stiffness <= 0:
             return np.inf
-        ratio = self.damping_ratio if self.damping > 0 else 0.0
-        return speed * np.sqrt(restitution(ratio) / self.stiffness)
+        return speed * np.sqrt(restitution(max(self.damping_ratio, 0.0)) / self.stiffness)
 
     def rise_steps(self, speed: float) -> float:
         """Return the number of steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
@@ -304,26 +303,16 @@ def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityRep
 def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
     if not scene.pairs:
         return
-    parameters = scene.contact_parameters()
-    columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
-    stiffness, damping, impedance, width, solref = (np.asarray(column, float) for column in columns)
-    friction = np.asarray(parameters.friction[:, 0], float)
-    is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    for i, pair in enumerate(scene.pairs):
+    present = scene.contact_parameters()
+    springiness = (present.stiffness, present.damping, present.solref, present.impedance, present.width)
+    rows = zip(*(np.asarray(column, float) for column in springiness), strict=True)
+    is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and scene.data.qpos.dtype == np.float32
+    for pair, friction, row in zip(scene.pairs, present.friction[:, 0].tolist(), rows, strict=True):
         geoms = [pair.geom1, pair.geom2]
         kinds = tuple(map(mujoco.mjtGeom, scene.mj_model.geom_type[geoms].tolist()))
-        springiness = (stiffness[i], damping[i], solref[i], impedance[i], width[i])
-        has_edges = is_pyramidal and pair.condim > 1 and scene.data.qpos.dtype == np.float32
-        yield _spring(
-            scene,
-            "contact",
-            str(pair),
-            *springiness,
-            size=_thickness(scene, geoms, kinds),
-            num_rows=most_contacts(kinds),
-            pyramid=float(friction[i]) if has_edges else None,
-            speed=speed,
-        )
+        pyramid = friction if is_pyramidal and pair.condim > 1 else None
+        rest = {"size": _thickness(scene, geoms, kinds), "num_rows": most_contacts(kinds), "pyramid": pyramid}
+        yield _spring(scene, "contact", str(pair), *row, **rest, speed=speed)
 
 
 def _others(scene: Scene) -> Iterator[Spring]:
