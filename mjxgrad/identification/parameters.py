@@ -1,6 +1,8 @@
 """Parameters to identify: named numbers between bounds, and the model fields that each of them changes."""
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -87,12 +89,9 @@ class Coordinates(eqx.Module):
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""
-        found, start = {}, 0
-        for name, shape in self.shapes:
-            size = int(np.prod(shape))
-            found[name] = vector[start : start + size].reshape(shape)  # pyright: ignore[reportIndexIssue]
-            start += size
-        return found
+        sizes = [math.prod(shape) for _, shape in self.shapes]
+        parts = zip(self.shapes, sizes, itertools.accumulate(sizes), strict=True)
+        return {name: vector[end - size : end].reshape(shape) for (name, shape), size, end in parts}  # pyright: ignore[reportIndexIssue]
 
     @property
     def scale(self) -> Float[Array, " dim"]:

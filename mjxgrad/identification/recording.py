@@ -102,13 +102,7 @@ class Recording:
 class Windows(eqx.Module):
     """Recordings of one scene as a batch; shorter ones are padded by rows of weight zero.
 
-    Attributes:
-        state: the initial states.
-        controls: one row per step.
-        index: index of the last state at or before each measurement.
-        share: position of the measurement between this state and the next, as a share of a step.
-        measured: measurements by name.
-        weight: reciprocal of the noise, 0 where nothing was measured.
+    A measurement is a share of a step after the state with its index. Weights are 1 / noise, 0 where nothing was measured.
     """
 
     state: State

@@ -269,8 +269,7 @@ def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -
     found = best = program(point)
     first = _rms(program, found)
     if not np.isfinite(first):
-        reason = "got one that diverged: begin elsewhere"
-        raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
+        raise DivergedError("nominal values must give motions that stay finite, got one that diverged: begin elsewhere")
     size = (first or 1.0) * math.sqrt(program.num_numbers) / _FIRST_SIZE
     linear = _linear_model(program, found, point, size)
     solver, state = _levenberg_marquardt(*linear[2].shape, point.dtype)

@@ -22,7 +22,7 @@ References:
 """
 
 from abc import abstractmethod
-from typing import Literal, Self
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -66,7 +66,7 @@ class Smoother(eqx.Module):
     ) -> LinearModel:
         """Return the linear model of the smoothed system; the key is consumed."""
 
-    def scaled(self, factor: ArrayLike) -> Self:
+    def scaled(self, factor: ArrayLike) -> "Smoother":
         """Return the smoother with its arrays, which are lengths and standard deviations, multiplied by a factor."""
         return jax.tree.map(lambda length: factor * length, self)
 
@@ -99,17 +99,16 @@ class Analytic(Smoother):
     def warnings(self, system: System, start: StateVector) -> list[str]:
         if self.smoothing is None or not isinstance(system, SceneSystem):
             return []
-        scene, traceable = system.scene, system.scene.model
-        if not all(is_known(x) for x in (start, traceable.geom_size, traceable.body_pos, traceable.geom_pos)):
+        given, pairs = system.scene.model, [pair for pair in system.scene.pairs if pair.condim > 1]
+        if not all(is_known(x) for x in (start, given.geom_size, given.body_pos, given.geom_pos)):
             return []
-        model = scene.to_mujoco()
+        model = system.scene.to_mujoco()
         data = mujoco.MjData(model)
         data.qpos[:] = start[: model.nq]
         mujoco.mj_fwdPosition(model, data)
-        touching = {frozenset(geoms) for geoms in data.contact.geom.tolist()}
-        fixed = set(np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0).tolist())
-        pairs = {pair: {pair.geom1, pair.geom2} for pair in scene.pairs if pair.condim > 1}
-        resting = [pair for pair, geoms in pairs.items() if geoms in touching and geoms & fixed]
+        is_fixed = model.body_weldid[model.geom_bodyid] == 0
+        touching = {frozenset(geoms) for geoms in data.contact.geom.tolist() if is_fixed[geoms].any()}
+        resting = [pair for pair in pairs if {pair.geom1, pair.geom2} in touching]
         if not resting:
             return []
         return [
