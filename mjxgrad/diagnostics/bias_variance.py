@@ -392,14 +392,15 @@ def _program(
 
 def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, plan: Plan) -> Samples:
     """Roll out samples for both estimates; all points share one compiled body."""
-    total = plan.num_units + plan.with_zero_noise
+    num_chunks, size = plan.chunks()
+    points, chunks = jnp.divmod(jnp.arange(len(params) * num_chunks), num_chunks)
 
-    def one(place: tuple[Array, Array]) -> Samples:
-        point, unit = place
-        return sample(objective, params[point], jax.random.fold_in(key, point), plan, unit[None])
+    def one_chunk(point_and_chunk: tuple[Array, Array]) -> Samples:
+        point, chunk = point_and_chunk
+        return sample(objective, params[point], jax.random.fold_in(key, point), plan, size * chunk + jnp.arange(size))
 
-    samples = map_in_chunks(one, jnp.divmod(jnp.arange(len(params) * total), total), DEFAULT_CHUNK_SIZE)
-    return jax.tree.map(lambda leaf: leaf.reshape(len(params), total, *leaf.shape[2:]), samples)
+    samples = jax.lax.map(one_chunk, (points, chunks))
+    return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
 
 
 def _by_parameters(samples: Samples) -> Samples:
