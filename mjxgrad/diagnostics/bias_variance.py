@@ -98,21 +98,14 @@ def cell_points(
 
 
 def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree:
-    """Apply a function under `jax.vmap` to points with a leading axis, one chunk at a time.
-
-    `jax.lax.map` with a batch size would compile the function a second time for the remainder.
-    """
+    """Apply a function under `jax.vmap` to points with a leading axis, one chunk at a time."""
     count = jax.tree.leaves(points)[0].shape[0]
     num_chunks = -(-count // chunk_size)
     size = -(-count // num_chunks)
-    # The last point fills up the last chunk.
+    # The last point fills up the last chunk: `jax.lax.map` would compile the function a second time for a remainder.
     indices = jnp.minimum(jnp.arange(num_chunks * size), count - 1)
-
-    def one_chunk(indices: Array) -> PyTree:
-        return jax.vmap(function)(jax.tree.map(lambda leaf: leaf[indices], points))
-
-    results = jax.lax.map(one_chunk, indices.reshape(num_chunks, size))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], results)
+    filled = jax.tree.map(lambda leaf: leaf[indices], points)
+    return jax.tree.map(lambda leaf: leaf[:count], jax.lax.map(function, filled, batch_size=size))
 
 
 class BiasVariance(eqx.Module):

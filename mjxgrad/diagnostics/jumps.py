@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 # A jump keeps at least this share of its change in a division. A slope keeps one part in many, a square root its root.
 _KEPT = 0.5
@@ -78,39 +78,26 @@ def jumps_along(
         raise ValueError(f"num_refinements must be at least 1, got {num_refinements}: without one a slope is a jump")
     grid = np.linspace(low, high, num_points)
     values = _evaluate(function, grid)
-    ends, at_ends, changes, is_jump = _refine(function, grid, values, num_candidates, num_refinements)
-    finite = np.isfinite(values).reshape(num_points, -1).all(axis=1)
-    is_jump &= changes > smallest * _norm(values[finite]).max(initial=0.0)
-    order = np.flatnonzero(is_jump)[np.argsort(ends[is_jump, 0])]
-    return Jumps(ends[order].mean(axis=1), at_ends[order, 0], at_ends[order, 1])
-
-
-def _refine(
-    function: Callable, grid: np.ndarray, values: np.ndarray, num_candidates: int, num_refinements: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bool[np.ndarray, " candidates"]]:
-    """Return the divided intervals, the values at their ends, their last changes, and whether each change remained."""
     steps = _changes(values)
     chosen = np.argsort(-steps, kind="stable")[:num_candidates]
-    ends = np.stack([grid[chosen], grid[chosen + 1]], axis=1)
-    at_ends = np.stack([values[chosen], values[chosen + 1]], axis=1)
-    changes, stayed = steps[chosen], np.zeros(len(chosen), bool)
-    num_inner = len(grid) // num_candidates
-    inner = np.arange(1, num_inner + 1) / (num_inner + 1)
-    rows = np.arange(len(chosen))
+    ends, at_ends = (np.stack([of[chosen], of[chosen + 1]], axis=1) for of in (grid, values))
+    changes, is_jump, rows = steps[chosen], np.zeros(len(chosen), bool), np.arange(len(chosen))
+    inner = np.linspace(0, 1, num_points // num_candidates + 2)[1:-1]
     for _ in range(num_refinements):
         between = ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * inner
         # The grid has one interval less than points, so a last row may be missing; the batch keeps its length.
-        batch = np.resize(between.ravel(), len(grid))
+        batch = np.resize(between.ravel(), num_points)
         found = _evaluate(function, batch)[: between.size].reshape(*between.shape, *values.shape[1:])
         places = np.concatenate([ends[:, :1], between, ends[:, 1:]], axis=1)
         all_values = np.concatenate([at_ends[:, :1], found, at_ends[:, 1:]], axis=1)
         parts = np.stack([_changes(row) for row in all_values])
         most = parts.argmax(axis=1)
-        ends = np.stack([places[rows, most], places[rows, most + 1]], axis=1)
-        at_ends = np.stack([all_values[rows, most], all_values[rows, most + 1]], axis=1)
-        stayed = parts[rows, most] > _KEPT * changes
-        changes = parts[rows, most]
-    return ends, at_ends, changes, stayed
+        ends, at_ends = (np.stack([of[rows, most], of[rows, most + 1]], axis=1) for of in (places, all_values))
+        is_jump, changes = parts[rows, most] > _KEPT * changes, parts[rows, most]
+    finite = np.isfinite(values).reshape(num_points, -1).all(axis=1)
+    is_jump &= changes > smallest * _norm(values[finite]).max(initial=0.0)
+    order = np.flatnonzero(is_jump)[np.argsort(ends[is_jump, 0])]
+    return Jumps(ends[order].mean(axis=1), at_ends[order, 0], at_ends[order, 1])
 
 
 def _evaluate(function: Callable, parameters: np.ndarray) -> np.ndarray:

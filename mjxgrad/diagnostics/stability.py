@@ -26,10 +26,8 @@ from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
 from mjxgrad.scene import Scene
 
-LEAST_FRICTION = 0.01
-"""Least friction of pyramids in single precision."""
-STEPS_IN_CONTACT = 6.0
-"""Fewest time steps in a bounce for the slope at MuJoCo's motion, by the experiment `bounce`."""
+_LEAST_FRICTION = 0.01  # of pyramids in single precision
+_STEPS_IN_CONTACT = 6.0  # fewest time steps in a bounce for the slope at MuJoCo's motion
 _WIDTH = 118  # characters in a laptop's terminal
 _COLUMNS = ("", "k, 1/s²", "b, 1/s", "ω₀, rad/s", "ζ", "t_c, ms", "asked, ms", "impedance", "load", "coupled", "steps")
 _LEGEND = (
@@ -38,7 +36,7 @@ _LEGEND = (
 )
 _SPEED_COLUMNS = ("depth", "rise, steps")
 # Fewest steps that resolve the rise of the impedance, and the largest first impedance that counts as continuous.
-STEPS_NEEDED, LARGEST_JUMP = 2.0, 0.01
+_STEPS_NEEDED, _LARGEST_JUMP = 2.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -122,16 +120,15 @@ class Spring:
     @property
     def num_steps(self) -> float:
         """Number of time steps in a single bounce, at any speed; infinite without stiffness."""
-        if self.stiffness <= 0 or self.damping <= 0:
-            return np.pi / np.sqrt(self.stiffness) / self.timestep if self.stiffness > 0 else np.inf
-        return 2 * bounce_angle(self.damping_ratio) / np.sqrt(self.stiffness) / self.timestep
+        if self.stiffness <= 0:
+            return np.inf
+        return 2 * bounce_angle(max(self.damping_ratio, 0.0)) / np.sqrt(self.stiffness) / self.timestep
 
     def depth(self, speed: float) -> float:
         r"""Return the depth in m of a bounce at a speed of approach, $v \sqrt e / \omega_0$, restitution $e$."""
         if self.stiffness <= 0:
             return np.inf
-        ratio = self.damping_ratio if self.damping > 0 else 0.0
-        return speed * np.sqrt(restitution(ratio) / self.stiffness)
+        return speed * np.sqrt(restitution(max(self.damping_ratio, 0.0)) / self.stiffness)
 
     def rise_steps(self, speed: float) -> float:
         """Return the number of steps in which the impedance rises at a speed of approach; infinite if it does not rise."""
@@ -234,16 +231,16 @@ def _warnings_at_rest(spring: Spring) -> Iterator[str]:
             f"once, at {spring.coupled_load:.2g} of it; use a time step below {format_number(step / spring.coupled_load)} s, "
             "or an impedance nearer to 1"
         )
-    if spring.kind != "equality" and spring.num_steps < STEPS_IN_CONTACT and spring.load < 1:
-        needed = format_number(step * spring.num_steps / STEPS_IN_CONTACT)
+    if spring.kind != "equality" and spring.num_steps < _STEPS_IN_CONTACT and spring.load < 1:
+        needed = format_number(step * spring.num_steps / _STEPS_IN_CONTACT)
         yield (
             f"a bounce lasts {spring.num_steps:.2g} time steps, too few for the slope at MuJoCo's motion, which needs about "
-            f"{STEPS_IN_CONTACT:g}; use a time step below {needed} s, or a softer contact"
+            f"{_STEPS_IN_CONTACT:g}; use a time step below {needed} s, or a softer contact"
         )
-    if spring.pyramid is not None and spring.pyramid < LEAST_FRICTION:
+    if spring.pyramid is not None and spring.pyramid < _LEAST_FRICTION:
         yield (
             f"a pyramid of friction {spring.pyramid:.2g} weighs its edges by its inverse square, which single precision does "
-            f'not resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {LEAST_FRICTION:g}'
+            f'not resolve; take elliptic cones (<option cone="elliptic"/>), double precision, or at least {_LEAST_FRICTION:g}'
         )
 
 
@@ -263,12 +260,12 @@ def _warnings_at(speed: float, spring: Spring) -> Iterator[str]:
             f"pushed back the way they came; take a stiffness of at least {format_number(needed)} 1/s²"
         )
     steps, jump = spring.rise_steps(speed), spring.impedance[0]
-    reasons = [f"begins with a jump, at an impedance of {jump:.3g}"] * (jump > LARGEST_JUMP)
-    reasons += [f"rises within {steps:.2g} time steps"] * (steps < STEPS_NEEDED)
+    reasons = [f"begins with a jump, at an impedance of {jump:.3g}"] * (jump > _LARGEST_JUMP)
+    reasons += [f"rises within {steps:.2g} time steps"] * (steps < _STEPS_NEEDED)
     if reasons:
         yield (
             f"at {speed:.4g} m/s its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-            f"contact=mg.Slope(), as tasks do by default, or an impedance from 0 over at least {STEPS_NEEDED * travel:.2g} m"
+            f"contact=mg.Slope(), as tasks do by default, or an impedance from 0 over at least {_STEPS_NEEDED * travel:.2g} m"
         )
 
 
@@ -304,26 +301,16 @@ def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityRep
 def _contacts(scene: Scene, speed: float | None) -> Iterator[Spring]:
     if not scene.pairs:
         return
-    parameters = scene.contact_parameters()
-    columns = (parameters.stiffness, parameters.damping, parameters.impedance, parameters.width, parameters.solref)
-    stiffness, damping, impedance, width, solref = (np.asarray(column, float) for column in columns)
-    friction = np.asarray(parameters.friction[:, 0], float)
-    is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    for i, pair in enumerate(scene.pairs):
+    present = scene.contact_parameters()
+    springiness = (present.stiffness, present.damping, present.solref, present.impedance, present.width)
+    rows = zip(*(np.asarray(column, float) for column in springiness), strict=True)
+    is_pyramidal = scene.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and scene.data.qpos.dtype == np.float32
+    for pair, friction, row in zip(scene.pairs, present.friction[:, 0].tolist(), rows, strict=True):
         geoms = [pair.geom1, pair.geom2]
         kinds = tuple(map(mujoco.mjtGeom, scene.mj_model.geom_type[geoms].tolist()))
-        springiness = (stiffness[i], damping[i], solref[i], impedance[i], width[i])
-        has_edges = is_pyramidal and pair.condim > 1 and scene.data.qpos.dtype == np.float32
-        yield _spring(
-            scene,
-            "contact",
-            str(pair),
-            *springiness,
-            size=_thickness(scene, geoms, kinds),
-            num_rows=most_contacts(kinds),
-            pyramid=float(friction[i]) if has_edges else None,
-            speed=speed,
-        )
+        pyramid = friction if is_pyramidal and pair.condim > 1 else None
+        rest = {"size": _thickness(scene, geoms, kinds), "num_rows": most_contacts(kinds), "pyramid": pyramid}
+        yield _spring(scene, "contact", str(pair), *row, **rest, speed=speed)
 
 
 def _others(scene: Scene) -> Iterator[Spring]:

@@ -20,16 +20,14 @@ from mjxgrad.identification.recording import Recording, start_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
-_Object = mujoco.mjtObj
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
 _NAMED = ("mass", "damping", "armature", "friction_loss", "gear")
 KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
 _WRITTEN = (
-    *((kind, field) for kind in ("geom", "pair") for field in ("friction", "solref", "solimp")),
-    *(("actuator", field) for field in ("gear", "gainprm", "biasprm")),
-    *(("dof", field) for field in ("damping", "armature", "frictionloss")),
-    *(("body", field) for field in ("mass", "ipos", "inertia", "iquat")),
+    *(f"{kind}_{field}" for kind in ("geom", "pair") for field in ("friction", "solref", "solimp")),
+    *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "dof_damping", "dof_armature", "dof_frictionloss"),
+    *("body_mass", "body_ipos", "body_inertia", "body_iquat"),
 )
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
@@ -109,7 +107,7 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
         found.setdefault(signal, np.full((len(times), width), np.nan))[:, index] = column
     controls = found.pop("ctrl", np.full((len(times), scene.model.nu), np.nan))
     if bad := np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist():
-        names = ", ".join(mujoco.mj_id2name(scene.mj_model, _Object.mjOBJ_ACTUATOR, i) or f"[{i}]" for i in bad)
+        names = ", ".join(scene.mj_model.actuator(i).name or f"[{i}]" for i in bad)
         raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; it lacks {names}")
     if not found:
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
@@ -145,23 +143,19 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
     """Return for each possible column name its kind, signal, index in the signal, and the signal's width."""
     whole: dict[str, list] = {}
-    own: list[tuple[str, str | None, str, Sequence[int], int]] = []
-    ends = [*model.jnt_qposadr[1:], model.nq]
-    for joint in range(model.njnt):
-        name = mujoco.mj_id2name(model, _Object.mjOBJ_JOINT, joint)
-        own.append(("qpos", name, "qpos", range(model.jnt_qposadr[joint], ends[joint]), model.nq))
-        own.append(("qvel", name, "qvel", np.flatnonzero(model.dof_jntid == joint).tolist(), model.nv))
-    for actuator in range(model.nu):
-        name = mujoco.mj_id2name(model, _Object.mjOBJ_ACTUATOR, actuator)
-        own.append(("ctrl", name, "ctrl", [actuator], model.nu))
-        first, count = model.actuator_actadr[actuator], model.actuator_actnum[actuator]
-        own.append(("act", name, "act", range(first, first + count) if first >= 0 else [], model.na))
-    for index in range(model.nsensor):
-        name, width = mujoco.mj_id2name(model, _Object.mjOBJ_SENSOR, index), int(model.sensor_dim[index])
-        own.append(("sensor", name, name or "", range(width), width))
-    for kind, name, signal, indices, width in own:
+    own: list[tuple[str, str, Sequence[int] | np.ndarray, int]] = []
+    for i, first, end in zip(range(model.njnt), model.jnt_qposadr, [*model.jnt_qposadr[1:], model.nq], strict=True):
+        name = model.joint(i).name
+        own.append(("qpos", name, range(first, end), model.nq))
+        own.append(("qvel", name, np.flatnonzero(model.dof_jntid == i), model.nv))
+    for i, first, count in zip(range(model.nu), model.actuator_actadr, model.actuator_actnum, strict=True):
+        name = model.actuator(i).name
+        own += [("ctrl", name, [i], model.nu), ("act", name, range(first, first + count), model.na)]
+    own += [("sensor", model.sensor(i).name, range(n), int(n)) for i, n in enumerate(model.sensor_dim)]
+    for kind, name, indices, width in own:
         for i, index in enumerate(indices):
-            place, number = (kind, signal, int(index), width), f"[{i}]" * (len(indices) > 1)
+            signal, number = name if kind == "sensor" else kind, f"[{i}]" * (len(indices) > 1)
+            place = (kind, signal, int(index), width)
             if kind != "sensor":
                 # A joint and an index may name the same place; for one number `qpos` is the whole.
                 whole[f"{kind}[{index}]" if width > 1 else kind] = [place]
@@ -191,11 +185,7 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
 
 
 def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:
-    """Split recordings into those to fit and those held out: every n-th of several, or the end of a single one.
-
-    Args:
-        recordings: all recordings.
-        share: held-out share, below 1; 0 holds out nothing.
+    """Split recordings into those to fit and a held-out share: every n-th of several, or the end of a single one.
 
     Raises:
         ValueError: if the share is negative or leaves nothing to fit.
@@ -218,35 +208,14 @@ def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Record
 
 
 def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) -> None:
-    """Write the MJCF of a scene with the identified numbers; all else stays as in the file.
-
-    Args:
-        scene: the scene as loaded.
-        found: the scene with the identified numbers.
-        source: the MJCF file of the scene.
-        path: the MJCF file to write.
-    """
+    """Write the MJCF file of a scene with the numbers that were found; all else stays as in the source."""
     spec = mujoco.MjSpec.from_file(str(source))
-    spec.compile()  # assigns element ids
-    elements = {"geom": spec.geoms, "pair": spec.pairs, "actuator": spec.actuators, "dof": spec.joints}
-    elements["body"] = spec.bodies
-    before, after = numbers_of(scene.model), {k: np.asarray(v, float) for k, v in numbers_of(found.model).items()}
-    for kind, field in _WRITTEN:
-        values = after[f"{kind}_{field}"]
-        differs = (np.asarray(before[f"{kind}_{field}"]) != values).any(axis=tuple(range(1, values.ndim)))
-        for row in np.flatnonzero(differs).tolist():
-            index = scene.mj_model.dof_jntid[row] if kind == "dof" else row
-            element = next(one for one in elements[kind] if one.id == index)
-            if kind == "body":
-                element.explicitinertial, element.mass = True, float(after["body_mass"][row])
-                place = [after[f"body_{name}"][row] for name in ("ipos", "inertia", "iquat")]
-                element.ipos, element.inertia, element.iquat = place
-                element.fullinertia[:] = np.nan
-                continue
-            present = np.array(getattr(element, field), float)
-            count = min(values[row].size, present.size)
-            present.ravel()[:count] = values[row].ravel()[:count]
-            setattr(element, field, present if present.ndim else float(present))
+    model = spec.compile()
+    before, after = numbers_of(scene.model), numbers_of(found.model)
+    for field in _WRITTEN:
+        old, new, present = (np.asarray(x, float) for x in (before[field], after[field], getattr(model, field)))
+        getattr(model, field)[:] = np.where(old != new, new, present)
+    spec.copy_back(model)
     for folder in ("meshdir", "texturedir"):
         there = Path(source).parent / (getattr(spec, folder) or "")
         setattr(spec, folder, os.path.relpath(there, Path(path).parent))

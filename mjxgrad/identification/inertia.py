@@ -19,6 +19,7 @@ References:
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import scipy.spatial
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Float
 
@@ -42,16 +43,13 @@ def inertia(scene: Scene, body: str) -> Parameter:
         ValueError: if there is no such body, or a flat body makes a logarithm infinite.
     """
 
-    def place(model: mjx.Model) -> int:
-        return index_of(model, mujoco.mjtObj.mjOBJ_BODY, body)
-
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
-        index = place(model)
-        parts = body_fields(pseudo_inertia(value))
+        index, parts = index_of(model, mujoco.mjtObj.mjOBJ_BODY, body), body_fields(pseudo_inertia(value))
         return {name: getattr(model, name).at[index].set(part) for name, part in parts.items()}
 
-    model, index = scene.model, place(scene.model)
-    fields = [np.asarray(getattr(model, f"body_{name}"), float)[index] for name in ("mass", "ipos", "inertia", "iquat")]
+    index = index_of(scene.model, mujoco.mjtObj.mjOBJ_BODY, body)
+    names = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+    fields = [np.asarray(getattr(scene.model, name), float)[index] for name in names]
     nominal = logarithms(second_moments(*fields))
     if not np.isfinite(nominal).all():
         raise ValueError(f"inertia needs a body with mass and extent in all directions, got {body!r}")
@@ -61,13 +59,7 @@ def inertia(scene: Scene, body: str) -> Parameter:
 def pseudo_inertia(numbers: Float[Array, "10"]) -> Float[Array, "4 4"]:
     """Return the pseudo-inertia of ten numbers (kg, kg m, kg m²)."""
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = numbers
-    zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
-    rows = [
-        [jnp.exp(d1), s12, s13, t1],
-        [zero, jnp.exp(d2), s23, t2],
-        [zero, zero, jnp.exp(d3), t3],
-        [zero, zero, zero, one],
-    ]
+    rows = [[jnp.exp(d1), s12, s13, t1], [0, jnp.exp(d2), s23, t2], [0, 0, jnp.exp(d3), t3], [0, 0, 0, 1]]
     root = jnp.exp(alpha) * jnp.array(rows)
     return root @ root.T
 
@@ -85,9 +77,7 @@ def logarithms(pseudo: np.ndarray) -> np.ndarray:
 
 def second_moments(mass: float | np.ndarray, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the pseudo-inertia from MuJoCo's fields of a body: mass, ipos, inertia and iquat."""
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, axes)
-    rotation = rotation.reshape(3, 3)
+    rotation = scipy.spatial.transform.Rotation.from_quat(axes, scalar_first=True).as_matrix()
     about_centre = rotation @ np.diag(moments.sum() / 2 - moments) @ rotation.T
     offset = np.append(centre, 1.0)
     return mass * np.outer(offset, offset) + np.pad(about_centre, (0, 1))

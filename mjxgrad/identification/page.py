@@ -1,5 +1,6 @@
 """Report of an identification as a page: the answer, signals before and after, and values."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,15 +20,7 @@ _SIZE = (4.6, 2.1)  # inches
 def identified_page(
     name: str, scene: Scene, result: Identification, recordings: Sequence[Recording], held_out: Sequence[Recording]
 ) -> str:
-    """Return a self-contained page; needs `mjxgrad[render]`.
-
-    Args:
-        name: name of the scene.
-        scene: the scene with the nominal values.
-        result: the result of the search.
-        recordings: the fitted recordings.
-        held_out: the held-out recordings.
-    """
+    """Return a self-contained page on the search from a scene with the nominal values; needs `mjxgrad[render]`."""
     condition = f"Condition number {result.condition_number:.2g}: beyond 100, combinations have narrower intervals."
     head, *rows = result.rows()
     numbers = Block(faults=result.warnings(), items=[condition], table=Table(head, rows))
@@ -55,30 +48,19 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
                 change = np.abs(new - old).max() / max(np.ptp(values[known]), 1e-12)
                 signals.append((change, names.get((name, i), name), times[known], values[known], old, new))
     signals.sort(key=lambda one: -one[0])
-    timestep = float(scene.model.opt.timestep)
-    drawings = [
-        svg(lambda one=one: _panel(*one[1:], timestep=timestep, fitted_until=fitted_until), f"{one[1]} over time")
-        for one in signals[:_MOST_SIGNALS]
-    ]
+    panel = functools.partial(_panel, float(scene.model.opt.timestep), fitted_until)
+    drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals[:_MOST_SIGNALS]]
     caption = "SI units. Dots: measured. Dashed: where the search began. Line: with the values found. Grey: held out."
     if len(signals) > len(drawings):
         caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
     return Block(drawings=drawings, caption=caption)
 
 
-def _panel(
-    title: str,
-    times: np.ndarray,
-    values: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    timestep: float,
-    fitted_until: float | None,
-) -> Any:
+def _panel(timestep: float, fitted_until: float | None, title: str, *signal: np.ndarray) -> Any:
     """Draw a signal over time: measured, at the start, identified; the curve at the start may leave the picture."""
     import matplotlib.pyplot as plt
 
-    figure, axis = plt.subplots(figsize=_SIZE)
+    (times, values, before, after), (figure, axis) = signal, plt.subplots(figsize=_SIZE)
     at = timestep * np.arange(len(before))
     end = max(at[-1], times.max())
     if fitted_until is not None:

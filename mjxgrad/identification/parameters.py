@@ -1,6 +1,8 @@
 """Parameters to identify: named numbers between bounds, and the model fields that each of them changes."""
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -59,12 +61,7 @@ class Parameter:
 class Coordinates(eqx.Module):
     """All parameters as one vector, and the search coordinates, in which each is scaled by its range.
 
-    Attributes:
-        nominal: the nominal values.
-        lower: the lower bounds.
-        upper: the upper bounds.
-        names: one name per number, `mass` or `gains[1]`.
-        shapes: name and shape of each parameter.
+    There is one of `names` per number, `mass` or `gains[1]`, and one of `shapes` per parameter, with its name.
     """
 
     nominal: Float[Array, " dim"]
@@ -92,12 +89,9 @@ class Coordinates(eqx.Module):
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""
-        found, start = {}, 0
-        for name, shape in self.shapes:
-            size = int(np.prod(shape))
-            found[name] = vector[start : start + size].reshape(shape)  # pyright: ignore[reportIndexIssue]
-            start += size
-        return found
+        sizes = [math.prod(shape) for _, shape in self.shapes]
+        parts = zip(self.shapes, sizes, itertools.accumulate(sizes), strict=True)
+        return {name: vector[end - size : end].reshape(shape) for (name, shape), size, end in parts}  # pyright: ignore[reportIndexIssue]
 
     @property
     def scale(self) -> Float[Array, " dim"]:
@@ -152,25 +146,18 @@ def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) 
     return _positive(nominal, bounds, write, "kg", "mass")
 
 
-def friction(
-    scene: Scene,
-    *,
-    pairs: tuple[tuple[str, str], ...] | None = None,
-    bounds: tuple[float, float] = (0.0, 2.0),
-    **subset: Any,
-) -> Parameter:
+def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset: Any) -> Parameter:
     """Return the common sliding friction of the selected contacts; all geoms that determine it receive the value.
 
     Args:
         scene: the scene with the nominal value.
-        pairs: pairs of geom names; None for all that can touch.
         bounds: least and greatest coefficient.
-        **subset: `geoms` in place of pairs, as in `Softness`.
+        **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
 
     Raises:
         ValueError: if a name is unknown or can touch nothing.
     """
-    named = Softness(pairs=pairs, **subset)
+    named = Softness(**subset)
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
         chosen = named.selected(model)

@@ -102,13 +102,7 @@ class Recording:
 class Windows(eqx.Module):
     """Recordings of one scene as a batch; shorter ones are padded by rows of weight zero.
 
-    Attributes:
-        state: the initial states.
-        controls: one row per step.
-        index: index of the last state at or before each measurement.
-        share: position of the measurement between this state and the next, as a share of a step.
-        measured: measurements by name.
-        weight: reciprocal of the noise, 0 where nothing was measured.
+    A measurement is a share of a step after the state with its index. Weights are 1 / noise, 0 where nothing was measured.
     """
 
     state: State
@@ -222,14 +216,9 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
 def simulated(
     scene: Scene, window: Windows, offset: Float[Array, " both"] | None, delay: Float[Array, ""] | None, **settings: Any
 ) -> tuple[dict[str, Array], Bool[Array, ""]]:
-    """Return all signals of a simulation by name, at the scene's own steps, and whether the motion diverged; traceable.
+    """Return all signals of a simulated window by name, at the scene's own steps, and whether it diverged; traceable.
 
-    Args:
-        scene: the scene with the present parameters.
-        window: one window, without the leading axis.
-        offset: change of the start, positions and velocities (m, rad, m/s, rad/s); None for none.
-        delay: delay of the controls beyond the recorded times (s); None for none.
-        **settings: as in `rollout`.
+    The offset changes the start, positions and velocities (m, rad, m/s, rad/s). The delay (s) is of the controls.
     """
     model, state, controls = scene.model, window.state, window.controls
     if offset is not None:
@@ -255,15 +244,7 @@ def residuals(
     *,
     contact: Contact,
 ) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
-    """Return the simulated less the measured signals of one window, in units of the noise, and whether the motion diverged.
-
-    Args:
-        scene: the scene with the present parameters.
-        window: one window, without the leading axis.
-        offset: as in `simulated`.
-        delay: as in `simulated`.
-        contact: as in `rollout`.
-    """
+    """Return the `simulated` less the measured signals of one window, in units of the noise, and whether it diverged."""
     found, diverged = simulated(scene, window, offset, delay, contact=contact)
     parts = []
     for name, measured in window.measured.items():

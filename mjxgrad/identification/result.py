@@ -14,6 +14,7 @@ References:
 import dataclasses
 import enum
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -41,17 +42,6 @@ class Stopped(enum.Enum):
     CONVERGED = "converged"
     STALLED = "stalled"
     STEPS = "max_steps reached"
-
-
-@dataclasses.dataclass(frozen=True)
-class Statistics:
-    """Statistics from the residuals and their derivative at the end; see `Identification` for the fields."""
-
-    covariance: Float[np.ndarray, "dim dim"]
-    half_width: Float[np.ndarray, " dim"]
-    condition_number: float
-    without_effect: tuple[str, ...]
-    inseparable: tuple[dict[str, float], ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,15 +123,8 @@ class Identification:
         rms = f"Residuals, in units of the noise: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
         if self.held_out_rms is not None:
             rms += f"; held out: {self.held_out_rms[0]:.3g} and {self.held_out_rms[1]:.3g}"
-        return "\n".join(
-            [
-                f"{head}, {self.stopped.value}.",
-                f"{rms}.",
-                "",
-                *aligned(self.rows()),
-                *[f"\n{line}" for line in self.warnings()],
-            ]
-        )
+        warnings = [f"\n{line}" for line in self.warnings()]
+        return "\n".join([f"{head}, {self.stopped.value}.", f"{rms}.", "", *aligned(self.rows()), *warnings])
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return the values as a table of text, header first: name and unit, value, interval, start, bounds."""
@@ -188,11 +171,7 @@ class Identification:
         return found
 
     def save(self, path: str | Path) -> None:
-        """Write values and bounds as YAML, in the format of `ParameterDict` in `mujoco.sysid`.
-
-        Args:
-            path: path of the file.
-        """
+        """Write values and bounds to a file as YAML, in the format of `ParameterDict` in `mujoco.sysid`."""
         bounds = self.coordinates.lower, self.coordinates.upper
         lower, upper = (self.coordinates.unravel(np.asarray(x)) for x in bounds)
         lines = []
@@ -210,16 +189,11 @@ def statistics(
     slope: Float[np.ndarray, "numbers dim"],
     num_numbers: int,
     num_offsets: int,
-) -> Statistics:
-    """Return the intervals, and the combinations that the recordings leave undetermined.
+) -> dict[str, Any]:
+    """Return the fields of `Identification` that residuals at the end and their derivative tell, half widths as a vector.
 
-    Args:
-        coordinates: names and bounds.
-        values: the values at the end.
-        residual: the residuals at the end, in units of the noise.
-        slope: derivative of the residuals by the values, orthogonal to the effect of the starts.
-        num_numbers: number of residuals that are measurements.
-        num_offsets: number of unknowns beside the parameters.
+    The derivative is by the values, orthogonal to the effect of the starts, which are `num_offsets` more unknowns. Of the
+    residuals `num_numbers` are measurements.
     """
     rounding = float(np.finfo(np.asarray(coordinates.nominal).dtype).eps)
     lengths = np.linalg.norm(slope, axis=0)
@@ -239,13 +213,14 @@ def statistics(
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
     half_width = scipy.special.stdtrit(freedom, (1 + _LEVEL) / 2) * np.sqrt(np.diag(covariance))
-    return Statistics(
-        covariance,
-        half_width,
-        float(sizes[0] / sizes[-1]) if sizes.size and sizes[-1] > 0 else np.inf,
-        tuple(name for name, felt in zip(coordinates.names, is_felt, strict=True) if not felt),
-        _combinations(blurred / lengths[is_felt], values[is_felt], np.array(coordinates.names)[is_felt]),
-    )
+    names = np.array(coordinates.names)
+    return {
+        "covariance": covariance,
+        "half_width": half_width,
+        "condition_number": float(sizes[0] / sizes[-1]) if sizes.size and sizes[-1] > 0 else np.inf,
+        "without_effect": tuple(names[~is_felt].tolist()),
+        "inseparable": _combinations(blurred / lengths[is_felt], values[is_felt], names[is_felt]),
+    }
 
 
 def exceeds_noise(rms: float, freedom: int) -> bool:
@@ -276,11 +251,8 @@ def _digits(value: float, half_width: float) -> str:
 
 
 def _yaml(number: float) -> str:
-    """Return a number as YAML 1.1 reads it: with a point, also before an exponent."""
-    if not np.isfinite(number):
-        return ".inf" if number > 0 else "-.inf"
-    mantissa, exponent, power = repr(float(number)).partition("e")
-    return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power
+    """Return a number as YAML 1.1 reads it: with a point, and without an exponent."""
+    return np.format_float_positional(number, trim="0").replace("inf", ".inf")
 
 
 def on_host(tree):

@@ -104,23 +104,14 @@ def identify(
 
 
 class _End(NamedTuple):
-    """The end of a descent.
-
-    Attributes:
-        point: the best point.
-        found: residuals and their derivatives there.
-        num_steps: number of steps.
-        has_ended: whether the search ended before the largest number of steps.
-        first: root mean square of the residuals at the start.
-        removable: share of the sum of squares that the linear model would still remove.
-    """
+    """The end of a descent: the best point, and how the search came there."""
 
     point: Array
-    found: tuple[Array, ...]
+    found: tuple[Array, ...]  # residuals and their derivatives there
     num_steps: int
-    has_ended: bool
-    first: float
-    removable: float
+    has_ended: bool  # before the largest number of steps
+    first: float  # root mean square of the residuals at the start
+    removable: float  # share of the sum of squares that the linear model would still remove
 
 
 def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], has_noise: bool) -> Identification:
@@ -129,7 +120,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
     values = np.asarray(coordinates.values(end.point[: len(coordinates.names)]), float)
     explained = on_host(end.found)
     residual, slope, num_offsets = _without_offsets(*explained)
-    verdict: dict[str, Any] = vars(statistics(coordinates, values, residual, slope, numbers, num_offsets)).copy()
+    verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     after, before = np.linalg.norm(residual), end.first * np.sqrt(numbers)
     rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
@@ -278,8 +269,7 @@ def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -
     found = best = program(point)
     first = _rms(program, found)
     if not np.isfinite(first):
-        reason = "got one that diverged: begin elsewhere"
-        raise DivergedError(f"the nominal values must give motions that stay finite, {reason}")
+        raise DivergedError("nominal values must give motions that stay finite, got one that diverged: begin elsewhere")
     size = (first or 1.0) * math.sqrt(program.num_numbers) / _FIRST_SIZE
     linear = _linear_model(program, found, point, size)
     solver, state = _levenberg_marquardt(*linear[2].shape, point.dtype)

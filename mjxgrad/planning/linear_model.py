@@ -33,7 +33,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
-from mjxgrad.contact.parameters import ContactPair
 from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
 from mjxgrad.stepping import Smoothing
 
@@ -67,9 +66,9 @@ class Smoother(eqx.Module):
     ) -> LinearModel:
         """Return the linear model of the smoothed system; the key is consumed."""
 
-    @abstractmethod
     def scaled(self, factor: ArrayLike) -> "Smoother":
-        """Return the smoother with its lengths and standard deviations multiplied by a factor."""
+        """Return the smoother with its arrays, which are lengths and standard deviations, multiplied by a factor."""
+        return jax.tree.map(lambda length: factor * length, self)
 
     def warnings(self, system: System, start: StateVector) -> list[str]:
         """Return warnings about unwanted effects of this smoothing at a start; none for traced numbers."""
@@ -97,14 +96,19 @@ class Analytic(Smoother):
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)
 
-    def scaled(self, factor: ArrayLike) -> "Analytic":
-        # Lengths are its only leaves.
-        return jax.tree.map(lambda length: factor * length, self)
-
     def warnings(self, system: System, start: StateVector) -> list[str]:
-        if self.smoothing is None or not isinstance(system, SceneSystem) or not is_known(start):
+        if self.smoothing is None or not isinstance(system, SceneSystem):
             return []
-        resting = _resting(system, np.asarray(start, float))
+        given, pairs = system.scene.model, [pair for pair in system.scene.pairs if pair.condim > 1]
+        if not all(is_known(x) for x in (start, given.geom_size, given.body_pos, given.geom_pos)):
+            return []
+        model = system.scene.to_mujoco()
+        data = mujoco.MjData(model)
+        data.qpos[:] = start[: model.nq]
+        mujoco.mj_fwdPosition(model, data)
+        is_fixed = model.body_weldid[model.geom_bodyid] == 0
+        touching = {frozenset(geoms) for geoms in data.contact.geom.tolist() if is_fixed[geoms].any()}
+        resting = [pair for pair in pairs if {pair.geom1, pair.geom2} in touching]
         if not resting:
             return []
         return [
@@ -140,8 +144,8 @@ class Sampled(Smoother):
 
     def step(self, system, state, control, key):
         """Return the mean of the finite next states; samples have mirror images, so a linear step has no error."""
-        stddev = self._stddev(system, state.dtype, least=1)
-        noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
+        stddev, unit = self._drawn(system, state, key, least=1)
+        noise = stddev * unit
         nominal, value = _sampled(system, state, control, jnp.concatenate([noise, -noise]))
         is_finite = jnp.all(jnp.isfinite(value), axis=1)
         return system.retract(nominal, _mean(value, is_finite))
@@ -157,13 +161,11 @@ class Sampled(Smoother):
 
         From each sample's next state the part that the other samples' mean Jacobian explains is subtracted.
         """
-        stddev = self._stddev(system, state.dtype, least=2)
-        noise = stddev * jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
+        stddev, unit = self._drawn(system, state, key, least=2)
+        noise = stddev * unit
         nominal, value, jacobian = _linearised(system, state, control, noise)
         value, jacobian = value[1:], jacobian[1:]
         is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
-        jacobian = jnp.where(is_finite[:, None, None], jacobian, 0.0)
-        value = jnp.where(is_finite[:, None], value, 0.0)
         count = is_finite.sum()
         mean = _mean(jacobian, is_finite)
         others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
@@ -178,8 +180,7 @@ class Sampled(Smoother):
         Its slope converges to the derivative of the mean (Stein's identity). A column without noise is zero.
         """
         least = system.num_changes + system.num_controls + 2
-        stddev = self._stddev(system, state.dtype, least)
-        unit = jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
+        stddev, unit = self._drawn(system, state, key, least)
         nominal, value = _sampled(system, state, control, stddev * unit)
         is_finite = jnp.all(jnp.isfinite(value), axis=1)
         value = jnp.where(is_finite[:, None], value, 0.0)
@@ -193,11 +194,13 @@ class Sampled(Smoother):
         jacobian = jnp.where(is_seen, slope[1:] / jnp.where(is_seen, stddev[:, None], 1.0), 0.0).T
         return _model(system, nominal, jacobian, slope[0], enough)
 
-    def _stddev(self, system: System, dtype: jnp.dtype, least: int) -> Float[Array, " both"]:
-        """Return the standard deviations of all coordinates of state and control."""
+    def _drawn(
+        self, system: System, state: StateVector, key: PRNGKeyArray, least: int
+    ) -> tuple[Float[Array, " both"], _Samples]:
+        """Return the standard deviations of all coordinates of state and control, and normal samples in units of them."""
         parts = []
         for name, size in (("stddev_state", system.num_changes), ("stddev_control", system.num_controls)):
-            value = jnp.asarray(getattr(self, name), dtype)
+            value = jnp.asarray(getattr(self, name), state.dtype)
             if value.shape not in ((), (size,)):
                 raise ValueError(f"{name} must be a number or have shape ({size},), got shape {value.shape}")
             if not isinstance(value, jax.core.Tracer) and not (np.asarray(value) >= 0).all():
@@ -205,28 +208,8 @@ class Sampled(Smoother):
             parts.append(jnp.broadcast_to(value, (size,)))
         if self.num_samples < least:
             raise ValueError(f"num_samples must be at least {least} for this system, got {self.num_samples}")
-        return jnp.concatenate(parts)
-
-    def scaled(self, factor: ArrayLike) -> "Sampled":
-        return Sampled(factor * self.stddev_state, factor * self.stddev_control, self.num_samples, self.order)
-
-
-def _resting(system: SceneSystem, start: np.ndarray) -> list[ContactPair]:
-    """Return the pairs that touch at a start, have friction and contain a fixed body, by C MuJoCo; none if traced."""
-    scene = system.scene
-    if not all(is_known(leaf) for leaf in (scene.model.geom_size, scene.model.body_pos, scene.model.geom_pos)):
-        return []
-    model = scene.to_mujoco()
-    data = mujoco.MjData(model)
-    data.qpos[:] = start[: model.nq]
-    mujoco.mj_fwdPosition(model, data)
-    touching = {frozenset(geoms) for geoms in data.contact.geom.tolist()}
-    is_fixed = model.body_weldid[model.geom_bodyid] == 0
-    return [
-        pair
-        for pair in scene.pairs
-        if pair.condim > 1 and {pair.geom1, pair.geom2} in touching and is_fixed[[pair.geom1, pair.geom2]].any()
-    ]
+        stddev = jnp.concatenate(parts)
+        return stddev, jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
 
 
 def _perturbed(system: System, state: StateVector, control: ControlVector, noise: Float[Array, " both"]) -> StateVector:

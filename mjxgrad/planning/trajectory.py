@@ -300,14 +300,14 @@ def backward_pass(
         hessian = stage.hessian + both.T @ value.hessian @ both
         q_u, q_uu, q_ux = gradient[n:], hessian[n:, n:], hessian[n:, :n]
         held = q_uu + regularisation * jnp.max(jnp.diag(q_uu)) * jnp.eye(len(q_u), dtype=q_u.dtype)
-        minimum = minimise_in_box(held, q_u, low, high)
-        k, K = minimum.value, -_solve_free(held, q_ux, minimum.is_free)
+        k, is_free, is_sound = minimise_in_box(held, q_u, low, high)
+        K = -_solve_free(held, q_ux, is_free)
         # The exact cost-to-go of this law: its shorter forms hold only without regularisation and limits.
         closed = jnp.concatenate([jnp.eye(n, dtype=K.dtype), K])
         affine = jnp.concatenate([jnp.zeros(n, k.dtype), k])
         value_hessian = closed.T @ hessian @ closed
         value = Quadratic(closed.T @ (gradient + hessian @ affine), 0.5 * (value_hessian + value_hessian.T))
-        return (value, promised - q_u @ k - 0.5 * k @ q_uu @ k, sound & minimum.is_sound), (k, K)
+        return (value, promised - q_u @ k - 0.5 * k @ q_uu @ k, sound & is_sound), (k, K)
 
     start = (terminal, jnp.zeros((), models.A.dtype), jnp.asarray(True))
     inputs = (models.A, models.B, stages, lower, upper)
@@ -316,18 +316,12 @@ def backward_pass(
     return Feedback(k, K, promised, sound)
 
 
-class BoxMinimum(eqx.Module):
-    """The minimiser in a box, its free coordinates, and whether their gradient is zero up to rounding (`is_sound`)."""
-
-    value: ControlVector
-    is_free: Bool[Array, " m"]
-    is_sound: Bool[Array, ""]
-
-
 def minimise_in_box(
     hessian: _Matrix, gradient: ControlVector, lower: ControlVector, upper: ControlVector
-) -> BoxMinimum:
+) -> tuple[ControlVector, Bool[Array, " m"], Bool[Array, ""]]:
     """Minimise ½ xᵀ H x + gᵀ x between bounds, by projected Newton steps; H must be positive definite.
+
+    Return the minimiser, which coordinates are free, and whether their gradient is zero up to rounding.
 
     References:
         Tassa, Mansard, Todorov. Control-Limited Differential Dynamic Programming. ICRA 2014, section III.
@@ -353,7 +347,7 @@ def minimise_in_box(
     slope, is_free = free(x)
     rounding = 1e3 * jnp.finfo(x.dtype).eps * (jnp.abs(hessian) @ jnp.abs(x) + jnp.abs(gradient))
     is_sound = jnp.all(jnp.isfinite(x)) & jnp.all(~is_free | (jnp.abs(slope) <= rounding))
-    return BoxMinimum(x, is_free, is_sound)
+    return x, is_free, is_sound
 
 
 def _solve_free(

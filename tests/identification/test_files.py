@@ -94,7 +94,7 @@ def test_the_written_scene_has_the_numbers_that_were_found(scene, tmp_path):
     """Every kind at once, compiled again: each field as in the scene."""
     source = tmp_path / "scene.xml"
     source.write_text(_SCENE)
-    given = ["mass:cart", "mass:ball", "friction", "damping:x", "armature:x=0..1", "friction_loss:x=0..1", "gear:x"]
+    given = ["mass:cart", "inertia:ball", "friction", "damping:x", "armature:x=0..1", "friction_loss:x=0..1", "gear:x"]
     wanted = named(scene, [*given, "gains:servo", "damping_ratio", "stiffness", "width"])
     values = {name: jnp.asarray(0.1 + 0.9 * one.nominal) for name, one in wanted.items()}
     found = write_all(scene, wanted, values)
@@ -102,8 +102,8 @@ def test_the_written_scene_has_the_numbers_that_were_found(scene, tmp_path):
     files.write_xml(scene, found, source, tmp_path / "out" / "found.xml")
     again, expected = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "found.xml")), found.to_mujoco()
     for field in (
-        "body_mass", "body_ipos", "dof_damping", "dof_armature", "dof_frictionloss", "geom_friction", "geom_solref",
-        "geom_solimp", "actuator_gear", "actuator_gainprm", "actuator_biasprm",
+        "body_mass", "body_ipos", "body_inertia", "dof_damping", "dof_armature", "dof_frictionloss", "geom_friction",
+        "geom_solref", "geom_solimp", "actuator_gear", "actuator_gainprm", "actuator_biasprm",
     ):  # fmt: skip
         np.testing.assert_allclose(getattr(again, field), getattr(expected, field), rtol=1e-4, atol=1e-6, err_msg=field)
 

@@ -1,5 +1,7 @@
 """What residuals and their derivative say of parameters: intervals, what has no effect, what cannot be told apart."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ def _coordinates(**nominal):
 
 def _judge(slope, residual, **nominal):
     values = np.array(list(nominal.values()), float)
-    return statistics(_coordinates(**nominal), values, residual, slope, len(residual), 0)
+    return SimpleNamespace(**statistics(_coordinates(**nominal), values, residual, slope, len(residual), 0))
 
 
 def test_intervals_cover_as_often_as_they_say():
@@ -81,4 +83,4 @@ def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():
     found = statistics(_coordinates(a=1.0, b=1.0), np.ones(2), flat, slope, 27, count)
     expected = (residual**2).sum() / (27 - 8) * np.linalg.inv(whole.T @ whole)[:2, :2]
     assert count == 6
-    np.testing.assert_allclose(found.covariance, expected, rtol=1e-10)
+    np.testing.assert_allclose(found["covariance"], expected, rtol=1e-10)
