@@ -135,19 +135,15 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
     for run in tree.joint_runs(model):
         axis = data.xaxis[run.joints]
         if run.kind in (_Joint.mjJNT_FREE, _Joint.mjJNT_BALL):
-            columns = pick(model.jnt_bodyid[run.joints], data.xmat).transpose(0, 2, 1)
-            axis = columns.reshape(-1, 3)
+            axis = pick(model.jnt_bodyid[run.joints], data.xmat).transpose(0, 2, 1)
         still = jnp.zeros_like(axis)
         if run.kind == _Joint.mjJNT_FREE:
-            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), columns.shape)  # pyright: ignore[reportPossiblyUnboundVariable]
-            angular.append(jnp.concatenate([jnp.zeros_like(columns), columns], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
-            linear.append(jnp.concatenate([along, jnp.zeros_like(columns)], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
-        elif run.kind == _Joint.mjJNT_SLIDE:
-            angular.append(still)
-            linear.append(axis)
+            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), axis.shape)
+            turning, moving = jnp.concatenate([still, axis], 1), jnp.concatenate([along, still], 1)
         else:
-            angular.append(axis)
-            linear.append(still)
+            turning, moving = (still, axis) if run.kind == _Joint.mjJNT_SLIDE else (axis, still)
+        angular.append(turning.reshape(-1, 3))
+        linear.append(moving.reshape(-1, 3))
     if not angular:
         return jnp.zeros((0, 6), data.qpos.dtype)
     turning = jnp.concatenate(angular)

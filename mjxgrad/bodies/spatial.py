@@ -23,16 +23,8 @@ _Vectors = Float[Array, "n 3"]
 _SERIES = 1e-4
 # Squared length below which a vector has no direction: its power -3/2 in the derivative must be finite in single precision.
 _NOTHING = 1e-20
-_CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 # Entries of a symmetric matrix in MuJoCo's order of an inertia.
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-def _cross_table() -> np.ndarray:
-    table = np.zeros((3, 3, 3))
-    for i, j, k in _CYCLES:
-        table[k, i, j], table[k, j, i] = 1, -1
-    return table
 
 
 def _quaternion_table() -> np.ndarray:
@@ -81,7 +73,7 @@ def _steiner_table() -> np.ndarray:
     return table
 
 
-_CROSS = _cross_table()
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(2, 0, 1)
 QUATERNION = _quaternion_table()
 cross = Bilinear(_CROSS)
 """a × b."""

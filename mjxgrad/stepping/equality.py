@@ -3,6 +3,8 @@
 Connect and weld subtract the drift J̇ v, the relative acceleration of moving bodies without joint accelerations. MJX lacks it.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -160,32 +162,32 @@ def _polynomial(
 
 
 def _coupling(
-    model: mjx.Model,
-    data: mjx.Data,
-    ids: np.ndarray,
-    positions: list[Array],
-    jacobians: list[Array],
-    weights: list[Array],
+    model: mjx.Model, data: mjx.Data, ids: np.ndarray, coordinate: Callable[[np.ndarray], tuple[Array, Array, Array]]
 ) -> Block:
-    """Return rows x₁ - p(x₂) for pairs of scalar coordinates; without a second one x₂ = 0."""
+    """Return rows x₁ - p(x₂) for pairs of coordinates, given by position, Jacobian and weight; without a second x₂ = 0."""
+    (position, row, weight), (other, other_row, other_weight) = map(
+        coordinate, (model.eq_obj1id[ids], model.eq_obj2id[ids])
+    )
     has_second = jnp.asarray(model.eq_obj2id[ids] >= 0, data.qpos.dtype)
-    value, slope = _polynomial(model.eq_data[ids][:, :5], positions[1] * has_second)
-    row = jacobians[0] - (slope * has_second)[:, None] * jacobians[1]
-    weight = (weights[0] + weights[1] * has_second)[:, None]
-    return _block(model, data, ids, row[:, None], (positions[0] - value)[:, None], weight)
+    value, slope = _polynomial(model.eq_data[ids][:, :5], other * has_second)
+    row = row - (slope * has_second)[:, None] * other_row
+    weight = (weight + other_weight * has_second)[:, None]
+    return _block(model, data, ids, row[:, None], (position - value)[:, None], weight)
 
 
 def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    addresses, dofs = ([table[joint] for joint in objects] for table in (model.jnt_qposadr, model.jnt_dofadr))
     unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
-    positions = [data.qpos[a] - model.qpos0[a] for a in addresses]
-    weights = [model.dof_invweight0[dof] for dof in dofs]
-    return _coupling(model, data, ids, positions, [unit[dof] for dof in dofs], weights)
+
+    def coordinate(joint: np.ndarray) -> tuple[Array, Array, Array]:
+        address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+        return data.qpos[address] - model.qpos0[address], unit[dof], model.dof_invweight0[dof]
+
+    return _coupling(model, data, ids, coordinate)
 
 
 def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    positions = [data.ten_length[t] - model.tendon_length0[t] for t in objects]
-    weights = [model.tendon_invweight0[t] for t in objects]
-    return _coupling(model, data, ids, positions, [data._impl.ten_J[t] for t in objects], weights)
+    def coordinate(tendon: np.ndarray) -> tuple[Array, Array, Array]:
+        stretch = data.ten_length[tendon] - model.tendon_length0[tendon]
+        return stretch, data._impl.ten_J[tendon], model.tendon_invweight0[tendon]
+
+    return _coupling(model, data, ids, coordinate)
