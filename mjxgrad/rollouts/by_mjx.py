@@ -22,16 +22,9 @@ from mjxgrad.stepping.onset import reach
 
 
 class _Carry(NamedTuple):
-    """The carry of the scan.
+    """The carry of the scan: the last good state, what to count as in `Trajectory`, and the tangent that measures growth.
 
-    Attributes:
-        state: the last good state.
-        before: the previous control, under which a policy observes; None for a policy that sees the state.
-        first_bad: the first bad step, −1 so far.
-        unsolved: number of steps whose solve was cut short.
-        crowded: number of steps with too few contact slots.
-        tangent: tangent of positions and velocities that measures growth.
-        growth: largest norm of the tangent.
+    `before` is the previous control, under which a policy observes; None for a policy that sees the state.
     """
 
     state: State

@@ -74,7 +74,8 @@ def rollout(
     native = arguments.native_motion(scene, contact)
     for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    arguments.check_policy_sees(policy_sees, observe)
+    if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
+        raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
     policy = controls if callable(controls) else None
     sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
     arguments.check_shapes(scene, state)

@@ -3,8 +3,6 @@
 Connect and weld subtract the drift J̇ v, the relative acceleration of moving bodies without joint accelerations. MJX lacks it.
 """
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -28,8 +26,8 @@ def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     of_kinds = {
         kinds.mjEQ_CONNECT: _connect,
         kinds.mjEQ_WELD: _weld,
-        kinds.mjEQ_JOINT: _joint,
-        kinds.mjEQ_TENDON: _tendon,
+        kinds.mjEQ_JOINT: _coupling,
+        kinds.mjEQ_TENDON: _coupling,
     }
     for kind, rows in of_kinds.items():
         if (ids := np.nonzero(model.eq_type == kind)[0]).size:
@@ -161,33 +159,23 @@ def _polynomial(
     return value, slope
 
 
-def _coupling(
-    model: mjx.Model, data: mjx.Data, ids: np.ndarray, coordinate: Callable[[np.ndarray], tuple[Array, Array, Array]]
-) -> Block:
-    """Return rows x₁ - p(x₂) for pairs of coordinates, given by position, Jacobian and weight; without a second x₂ = 0."""
-    (position, row, weight), (other, other_row, other_weight) = map(
-        coordinate, (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    )
+def _coupling(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
+    """Return rows x₁ - p(x₂) for pairs of joints or tendons; without a second one x₂ = 0."""
+    places = dofs = (model.eq_obj1id[ids], model.eq_obj2id[ids])
+    if model.eq_type[ids[0]] == mujoco.mjtEq.mjEQ_TENDON:
+        present, rest, entries, weights = (
+            data.ten_length,
+            model.tendon_length0,
+            data._impl.ten_J,
+            model.tendon_invweight0,
+        )
+    else:
+        places, dofs = ([table[joint] for joint in places] for table in (model.jnt_qposadr, model.jnt_dofadr))
+        present, rest, weights = data.qpos, model.qpos0, model.dof_invweight0
+        entries = jnp.eye(model.nv, dtype=data.qpos.dtype)
+    first, second = (present[place] - rest[place] for place in places)
     has_second = jnp.asarray(model.eq_obj2id[ids] >= 0, data.qpos.dtype)
-    value, slope = _polynomial(model.eq_data[ids][:, :5], other * has_second)
-    row = row - (slope * has_second)[:, None] * other_row
-    weight = (weight + other_weight * has_second)[:, None]
-    return _block(model, data, ids, row[:, None], (position - value)[:, None], weight)
-
-
-def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
-
-    def coordinate(joint: np.ndarray) -> tuple[Array, Array, Array]:
-        address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        return data.qpos[address] - model.qpos0[address], unit[dof], model.dof_invweight0[dof]
-
-    return _coupling(model, data, ids, coordinate)
-
-
-def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    def coordinate(tendon: np.ndarray) -> tuple[Array, Array, Array]:
-        stretch = data.ten_length[tendon] - model.tendon_length0[tendon]
-        return stretch, data._impl.ten_J[tendon], model.tendon_invweight0[tendon]
-
-    return _coupling(model, data, ids, coordinate)
+    value, slope = _polynomial(model.eq_data[ids][:, :5], second * has_second)
+    row = entries[dofs[0]] - (slope * has_second)[:, None] * entries[dofs[1]]
+    weight = (weights[dofs[0]] + weights[dofs[1]] * has_second)[:, None]
+    return _block(model, data, ids, row[:, None], (first - value)[:, None], weight)

@@ -45,9 +45,8 @@ def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
             "model and data must be of MJX's JAX implementation, got "
             f"{model.impl} and {data.impl}: create them with impl='jax'"
         )
-    if (
-        model.opt.solver == mujoco.mjtSolver.mjSOL_PGS
-    ):  # MJX lacks it; it marks the models of scenes that C MuJoCo steps
+    # MJX lacks this solver; it marks the models of scenes that C MuJoCo steps.
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise ValueError("this model is of a scene that C MuJoCo steps, as scene.unsupported says: use mg.rollout")
     with jax.default_matmul_precision("highest"):
         yield
