@@ -2,12 +2,10 @@ r"""Kinematics, inertia and bias forces: the smooth stages of a step, without re
 
 MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes.
 No quantity is transformed between bodies, so the usual recursion over the tree becomes a sum over ancestors or descendants:
-a product with a constant 0/1 matrix. Only orientations multiply. Their products from the root are formed by doubling, in a
-number of rounds that is logarithmic in the depth of the tree.
+a product with a constant 0/1 matrix. Only orientations multiply, see `orientation`.
 
-MJX walks the tree level by level and gathers and scatters between levels, which is slow in reverse mode. The stages here
-fill the same fields of `mjx.Data` with the same values. One difference is intended: bodies fixed to a mocap body follow it,
-as in C MuJoCo.
+MJX walks the tree level by level, which is slow in reverse mode. The stages here fill the same fields of `mjx.Data` with the
+same values. One difference is intended: bodies fixed to a mocap body follow it, as in C MuJoCo.
 
 References:
     Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.

@@ -2,9 +2,8 @@
 
 Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`. Five more kinds of pair differ from MJX.
 
-A box on a plane. MJX searches corners within 1 mm of the deepest one. A tilted box loses corners that still touch, and its
-contacts change places as it turns. C MuJoCo and this library take the lower end of each of the four diagonals. No search is
-needed, and a contact always belongs to the same diagonal.
+A box on a plane. MJX takes corners within 1 mm of the deepest one, and loses others that still touch. C MuJoCo and this library
+take the lower end of each of the four diagonals, so a contact always belongs to the same diagonal.
 
 Two faces, one of them of a mesh. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
 For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.

@@ -7,18 +7,13 @@ Minimise over a
 with the laws s_i of `constraint`. The problem is strictly convex: the start affects the time taken, not the solution.
 
 **Line search.** Along a line the derivative of the cost is monotone and, without elliptic rows and noise, piecewise linear.
-Newton's method inside a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. (The values at
-all breakpoints give the minimiser without iterating, but take rows² work: three times slower at 24 rows.) Elliptic cones
-need the loop. Near the apex their curvature holds on one side only, so the minimiser may lie at a thousandth of the Newton
-step, and a step that was not checked may raise the cost.
+Newton's method inside a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. (Values at all
+breakpoints take rows² work: three times slower at 24 rows.) Near the apex of an elliptic cone the curvature holds on one side
+only. The minimiser may lie at a thousandth of the Newton step there, so its loop checks every step.
 
 **Convergence.** The solve ends by the Newton decrement gᵀ H⁻¹ g, the remaining step in the norm of kinetic energy. It does
-not depend on the units of joints or on the ratios of masses.
-
-The same steps solve a batch, operation by operation, and a single state in a GPU's program; `Problem` holds the difference.
-
-The gradient is formed anew in each iteration: in single precision an update along the line would keep rounding errors from
-a poor start.
+not depend on the units of joints or on the ratios of masses. The gradient is formed anew in each iteration: in single precision
+an update along the line would keep rounding errors from a poor start.
 """
 
 import dataclasses

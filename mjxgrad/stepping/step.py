@@ -1,9 +1,8 @@
 """The differentiable step: MJX's stages in order, with our own rows, solve and integration.
 
-Drop-ins for `mjx.step`, `mjx.forward` and `mjx.solve` on any model and data of MJX's JAX implementation. Stages without work (no
-actuators, tendons, sensors or rows) are skipped when the program is traced. `jax.jit` removes unused results: camera poses, the
-unconstrained acceleration, the factor of the mass matrix. Therefore the solve starts from the last acceleration alone. MJX also
-evaluates the unconstrained one to choose the better start, which takes another factorisation.
+Stages without work (no actuators, tendons, sensors or rows) are skipped when the program is traced. `jax.jit` removes unused
+results: camera poses, the unconstrained acceleration, the factor of the mass matrix. Therefore the solve starts from the last
+acceleration alone. MJX also evaluates the unconstrained one, which takes another factorisation.
 
 Matrix products request full precision: NVIDIA GPUs otherwise round factors to ten bits, contact Jacobians included.
 """
