@@ -87,7 +87,7 @@ def _joint_motion(
 ) -> tuple[_Position, Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
     """Return normalised positions and each joint's quaternion, displacement along its axis, and position if free."""
     dtype = qpos.dtype
-    kept, turns, ways, origins = [], [], [], []
+    parts = []
     for run in tree.joint_runs(model):
         q, count = qpos[run.qpos], run.joints.stop - run.joints.start
         turn = jnp.asarray(np.tile(_IDENTITY, (count, 1)), dtype)
@@ -106,11 +106,10 @@ def _joint_motion(
                 q = jnp.concatenate([origin, turn], axis=1).reshape(-1)
             else:
                 q = turn.reshape(-1)
-        for values, value in zip((kept, turns, ways, origins), (q, turn, way, origin), strict=True):
-            values.append(value)
-    if not kept:
+        parts.append((q, turn, way, origin))
+    if not parts:
         return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))  # pyright: ignore[reportReturnType]
-    return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
+    return tuple(jnp.concatenate(x) for x in zip(*parts, strict=True))  # pyright: ignore[reportReturnType]
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -63,16 +63,6 @@ def _momentum_table() -> np.ndarray:
     return table
 
 
-def _steiner_table() -> np.ndarray:
-    """Return the table of |o|² m - o (m o)ᵀ, as entries, from o and m o."""
-    table = np.zeros((6, 3, 3))
-    for entry, (i, j) in enumerate(_ENTRIES):
-        table[entry, i, j] -= 1
-        if i == j:
-            table[entry] += np.eye(3)
-    return table
-
-
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(2, 0, 1)
 QUATERNION = _quaternion_table()
 cross = Bilinear(_CROSS)
@@ -86,7 +76,8 @@ cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
 """v ×* force, the rate of a force fixed to a body of velocity v; -(v ×)ᵀ force."""
 momentum = Bilinear(_momentum_table())
 """Inertia times motion."""
-_steiner = Bilinear(_steiner_table())
+# |o|² m - o (m o)ᵀ, as entries, from o and m o.
+_steiner = Bilinear(np.array([(i == j) * np.eye(3) - np.outer(np.eye(3)[i], np.eye(3)[j]) for i, j in _ENTRIES]))
 
 
 def cross_matrix(a: _Vectors) -> _Matrices:

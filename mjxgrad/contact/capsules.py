@@ -139,11 +139,5 @@ def _frames(normal: _Vectors, towards: _Vectors) -> _Frames:
     return jnp.stack([normal, tangent, cross(normal, tangent)], axis=1)
 
 
-def _products_table() -> np.ndarray:
-    """Return the table of a·b, a·c and b·c from (a, b) and (b, c)."""
-    table, eye = np.zeros((3, 6, 6)), np.eye(3)
-    table[0, :3, :3] = table[1, :3, 3:] = table[2, 3:, 3:] = eye
-    return table
-
-
-_products = Bilinear(_products_table())
+_products = Bilinear(np.kron([[[1, 0], [0, 0]], [[0, 1], [0, 0]], [[0, 0], [0, 1]]], np.eye(3)))
+"""a·b, a·c and b·c, from (a, b) and (b, c)."""

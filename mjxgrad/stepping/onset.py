@@ -148,12 +148,7 @@ def _depth(solimp: Float[Array, "contacts 5"]) -> _PerContact:
 
 
 def _creep(
-    gravity: Float[Array, ""],
-    press: Float[Array, "..."],
-    h: Float[Array, ""],
-    stiffness: _PerContact,
-    damping: _PerContact,
-    depth: _PerContact,
+    gravity: Array, press: Array, h: Array, stiffness: _PerContact, damping: _PerContact, depth: _PerContact
 ) -> _PerContact:
     """Return the speed u below which gravity and pressing forces move bodies faster than they approach."""
     resistance = damping + safe_sqrt(stiffness)
