@@ -45,8 +45,8 @@ Where w has its floor, r is taken ahead, r + h v (1 - h²v²/w²), which damps o
 
 **Change of sides.** The normal flips where two centres pass each other along it (a ball driven through a thin wall). It turns by
 a right angle where another face of a box becomes the nearest to a ball's centre within the box. The present side then acts for
-ψ = 1/2 + δ / w of the step, with δ how much nearer it is and w the change of δ in a step, and the other side for the rest.
-This covers geoms with a centre of symmetry, and balls in boxes.
+ψ = min(1, 1/2 + δ / w) of the step, the other side for the rest. Here δ is how much nearer the present side is, and w is how
+much δ changes in a step. This covers geoms with a centre of symmetry, and balls in boxes.
 
 **Limits.** True discontinuities remain: hit or miss, an edge that catches or not. So do jumps where two boxes change their
 touching faces, and where three faces of a box are equally near within a step. A contact shorter than about three steps is smooth
