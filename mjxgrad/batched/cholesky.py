@@ -1,11 +1,9 @@
 """Batched Cholesky solves with symmetric matrices of joint-space size.
 
 Arrays may carry the batch as trailing axis, see `linear`. A CPU runs the factorisation column by column, each operation along
-the batch. It is written out, or, where that would take long to compile, runs block by block with a loop over the columns of a
-block. On a GPU starting these operations would dominate the solve, so it is one kernel.
+the batch. It is written out, or, where that would take long to compile, runs block by block. A GPU has one kernel for it.
 
-A CPU does not use LAPACK for batches. LAPACK takes one matrix after the other, and jaxlib before 0.11 waits within the
-threads that share the batch. When as many programs wait as there are threads, they deadlock.
+A CPU does not use LAPACK for batches: it takes one matrix after the other. With jaxlib before 0.11 its threads may deadlock.
 """
 
 from typing import Protocol, runtime_checkable

@@ -5,8 +5,7 @@ parts of the library have two implementations and choose one here.
 
 XLA runs one small operation after another, and the second core of a CPU idles most of that time. As two devices
 (`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
-the cores work in parallel, and each waits only for the slowest member of its half of the batch. With several GPUs the same call
-uses them all.
+the cores work in parallel by `over_devices`, and so do several GPUs.
 """
 
 import functools

@@ -1,8 +1,7 @@
 r"""Linear and bilinear maps and Einstein sums of many short vectors: JAX primitives with fast derivatives.
 
-Their derivatives are sums of the same kind. Components written out would be slices, products and a concatenation. JAX's
-derivative of a slice, though, is a padded array, and sums of many of these make reverse mode slow. The derivative of a gather
-is a scatter, which XLA's CPU backend runs entry by entry.
+Their derivatives are sums of the same kind. JAX's derivative of a slice is a padded array, and sums of many of these make
+reverse mode slow. The derivative of a gather is a scatter, which XLA's CPU backend runs entry by entry.
 
 **On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory. Operations then run along whole vectors of
 states, and each number of a state is contiguous over the batch. XLA propagates layouts, so it suffices that all primitives

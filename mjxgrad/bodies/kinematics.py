@@ -2,12 +2,10 @@ r"""Kinematics, inertia and bias forces: the smooth stages of a step, without re
 
 MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes.
 No quantity is transformed between bodies, so the usual recursion over the tree becomes a sum over ancestors or descendants:
-a product with a constant 0/1 matrix. Only orientations multiply. Their products from the root are formed by doubling, in a
-number of rounds that is logarithmic in the depth of the tree.
+a product with a constant 0/1 matrix. Only orientations multiply, see `orientation`.
 
-MJX walks the tree level by level and gathers and scatters between levels, which is slow in reverse mode. The stages here
-fill the same fields of `mjx.Data` with the same values. One difference is intended: bodies fixed to a mocap body follow it,
-as in C MuJoCo.
+MJX walks the tree level by level, which is slow in reverse mode. The stages here fill the same fields of `mjx.Data` with the
+same values. One difference is intended: bodies fixed to a mocap body follow it, as in C MuJoCo.
 
 References:
     Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.
@@ -89,7 +87,7 @@ def _joint_motion(
 ) -> tuple[_Position, Float[Array, "njnt 4"], Float[Array, " njnt"], Float[Array, "njnt 3"]]:
     """Return normalised positions and each joint's quaternion, displacement along its axis, and position if free."""
     dtype = qpos.dtype
-    kept, turns, ways, origins = [], [], [], []
+    parts = []
     for run in tree.joint_runs(model):
         q, count = qpos[run.qpos], run.joints.stop - run.joints.start
         turn = jnp.asarray(np.tile(_IDENTITY, (count, 1)), dtype)
@@ -108,11 +106,10 @@ def _joint_motion(
                 q = jnp.concatenate([origin, turn], axis=1).reshape(-1)
             else:
                 q = turn.reshape(-1)
-        for values, value in zip((kept, turns, ways, origins), (q, turn, way, origin), strict=True):
-            values.append(value)
-    if not kept:
+        parts.append((q, turn, way, origin))
+    if not parts:
         return qpos, *(jnp.zeros((0, *shape), dtype) for shape in ((4,), (), (3,)))  # pyright: ignore[reportReturnType]
-    return tuple(jnp.concatenate(x) for x in (kept, turns, ways, origins))  # pyright: ignore[reportReturnType]
+    return tuple(jnp.concatenate(x) for x in zip(*parts, strict=True))  # pyright: ignore[reportReturnType]
 
 
 def com_pos(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -135,19 +132,15 @@ def _joint_axes(model: mjx.Model, data: mjx.Data, centre: Float[Array, "nbody 3"
     for run in tree.joint_runs(model):
         axis = data.xaxis[run.joints]
         if run.kind in (_Joint.mjJNT_FREE, _Joint.mjJNT_BALL):
-            columns = pick(model.jnt_bodyid[run.joints], data.xmat).transpose(0, 2, 1)
-            axis = columns.reshape(-1, 3)
+            axis = pick(model.jnt_bodyid[run.joints], data.xmat).transpose(0, 2, 1)
         still = jnp.zeros_like(axis)
         if run.kind == _Joint.mjJNT_FREE:
-            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), columns.shape)  # pyright: ignore[reportPossiblyUnboundVariable]
-            angular.append(jnp.concatenate([jnp.zeros_like(columns), columns], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
-            linear.append(jnp.concatenate([along, jnp.zeros_like(columns)], 1).reshape(-1, 3))  # pyright: ignore[reportPossiblyUnboundVariable]
-        elif run.kind == _Joint.mjJNT_SLIDE:
-            angular.append(still)
-            linear.append(axis)
+            along = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), axis.shape)
+            turning, moving = jnp.concatenate([still, axis], 1), jnp.concatenate([along, still], 1)
         else:
-            angular.append(axis)
-            linear.append(still)
+            turning, moving = (still, axis) if run.kind == _Joint.mjJNT_SLIDE else (axis, still)
+        angular.append(turning.reshape(-1, 3))
+        linear.append(moving.reshape(-1, 3))
     if not angular:
         return jnp.zeros((0, 6), data.qpos.dtype)
     turning = jnp.concatenate(angular)

@@ -2,9 +2,8 @@
 
 Guards that keep a value finite do not always keep its derivative finite. `x + eps * (x == 0)` lets 1e-21 through, and the
 derivative of a quotient divides by its square, which overflows in single precision. Infinity times the zero of a branch not
-taken is NaN. Such guards lie deep within MJX. This module copies the modules that hold them, replaces a few functions, and lets
-the copies call each other. That is shorter than new callers, and leaves other users of MJX alone. Values are MJX's to the bit,
-except where a guard acts and where the list says otherwise:
+taken is NaN. This module copies the modules that hold such guards, replaces a few functions, and lets the copies call each
+other. Values are MJX's to the bit, except where a guard acts and where the list says otherwise:
 
 - `collision_convex`, in `contact.collision`: two quotients, where an edge meets a plane and where a face meets another.
 - `support.muscle_dynamics_timescale`: the smooth switch, a quintic in a quotient by a width that is zero by default.

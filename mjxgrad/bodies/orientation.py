@@ -1,7 +1,7 @@
 r"""Orientations of bodies: products of turns, or sums of angles where all turns of a chain share one axis.
 
 A turn is the fixed rotation of a body, then the joint's rotation about an axis fixed to the rotated frame. In general
-orientations are products of turns from the root, formed by doubling.
+orientations are products of turns from the root, formed by doubling, in rounds logarithmic in the depth of the tree.
 
 Most legged robots and arms of the benchmarks are planar: all hinges of a chain stay parallel in the world, at any angles. With
 the common axis a the orientation after a turn is

@@ -23,16 +23,8 @@ _Vectors = Float[Array, "n 3"]
 _SERIES = 1e-4
 # Squared length below which a vector has no direction: its power -3/2 in the derivative must be finite in single precision.
 _NOTHING = 1e-20
-_CYCLES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 # Entries of a symmetric matrix in MuJoCo's order of an inertia.
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-def _cross_table() -> np.ndarray:
-    table = np.zeros((3, 3, 3))
-    for i, j, k in _CYCLES:
-        table[k, i, j], table[k, j, i] = 1, -1
-    return table
 
 
 def _quaternion_table() -> np.ndarray:
@@ -71,17 +63,7 @@ def _momentum_table() -> np.ndarray:
     return table
 
 
-def _steiner_table() -> np.ndarray:
-    """Return the table of |o|² m - o (m o)ᵀ, as entries, from o and m o."""
-    table = np.zeros((6, 3, 3))
-    for entry, (i, j) in enumerate(_ENTRIES):
-        table[entry, i, j] -= 1
-        if i == j:
-            table[entry] += np.eye(3)
-    return table
-
-
-_CROSS = _cross_table()
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(2, 0, 1)
 QUATERNION = _quaternion_table()
 cross = Bilinear(_CROSS)
 """a × b."""
@@ -94,7 +76,8 @@ cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
 """v ×* force, the rate of a force fixed to a body of velocity v; -(v ×)ᵀ force."""
 momentum = Bilinear(_momentum_table())
 """Inertia times motion."""
-_steiner = Bilinear(_steiner_table())
+# |o|² m - o (m o)ᵀ, as entries, from o and m o.
+_steiner = Bilinear(np.array([(i == j) * np.eye(3) - np.outer(np.eye(3)[i], np.eye(3)[j]) for i, j in _ENTRIES]))
 
 
 def cross_matrix(a: _Vectors) -> _Matrices:

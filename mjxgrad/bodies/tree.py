@@ -73,38 +73,32 @@ def joint_runs(model: mjx.Model) -> tuple[Run, ...]:
 
 def frames(model: mjx.Model) -> Frames:
     """Return the turns of a model."""
-    body, joint, mocap, previous = [], [], [], []
+    turns: list[tuple[int, int, int, int]] = []  # body, joint, mocap body, and the turn before
     of_body, before_body = np.full(model.nbody, -1), np.full(model.nbody, -1)
     before_joint, after_joint = np.full(model.njnt, -1), np.full(model.njnt, -1)
     is_first = np.ones(model.njnt, bool)
     for b in range(model.nbody):
-        last = of_body[model.body_parentid[b]] if model.body_parentid[b] else -1
+        last = int(of_body[model.body_parentid[b]]) if model.body_parentid[b] else -1
         before_body[b] = last
-        begun = len(body)
+        begun = len(turns)
         for j in joints_of(model, b):
-            before_joint[j], is_first[j] = last, len(body) == begun
+            before_joint[j], is_first[j] = last, len(turns) == begun
             if model.jnt_type[j] == _SLIDE:
                 continue
             is_free = model.jnt_type[j] == _FREE
-            body.append(b if is_first[j] and not is_free else -1)
-            joint.append(j)
-            mocap.append(-1)
-            previous.append(last)
-            last = len(body) - 1
+            turns.append((b if is_first[j] and not is_free else -1, j, -1, last))
+            last = len(turns) - 1
             after_joint[j] = -1 if is_free else last
-        if len(body) == begun:
+        if len(turns) == begun:
             is_mocap = model.body_mocapid[b] >= 0
-            body.append(-1 if is_mocap or b == 0 else b)
-            joint.append(-1)
-            mocap.append(model.body_mocapid[b])
-            previous.append(last)
-            last = len(body) - 1
+            turns.append((-1 if is_mocap or b == 0 else b, -1, model.body_mocapid[b], last))
+            last = len(turns) - 1
         of_body[b] = last
-    jumps, before = [], np.array(previous, int)
+    body, joint, mocap, before = np.array(turns, int).T
+    jumps = []
     while (before >= 0).any():
         jumps.append(before)
         before = np.where(before >= 0, before[before], -1)
-    body, joint, mocap = (np.array(x, int) for x in (body, joint, mocap))
     return Frames(body, joint, mocap, tuple(jumps), of_body, before_body, before_joint, is_first, after_joint)
 
 

@@ -1,7 +1,7 @@
 """Tendons on spheres and cylinders: points of contact and wrapped lengths.
 
-MJX computes these with three faults. A tendon whose end lies on the axis has a NaN derivative, from a square root. So has a
-short arc, from an arccosine that rounding puts at one. Inside a ring MJX takes five steps of a search that needs up to twenty.
+MJX has NaN derivatives where a tendon's end lies on the axis, and on short arcs, whose cosine rounding puts at one. Inside a
+ring it takes five steps of a search that needs up to twenty.
 
 A tendon through a ring (its sidesite lies within) bends at the point e of the ring where its path is shortest, unless its
 straight line passes too. With a and b its ends, a/|a - e| + b/|b - e| points along e there. The point is bracketed between

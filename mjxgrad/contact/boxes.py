@@ -49,13 +49,7 @@ _CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
 
 
 class Box(NamedTuple):
-    """A box.
-
-    Attributes:
-        centre: its centre (m).
-        axes: its axes as columns.
-        half: half its lengths (m).
-    """
+    """A box: its centre (m), its axes as columns, and half its lengths (m)."""
 
     centre: _Vector
     axes: _Matrix

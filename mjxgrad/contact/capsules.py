@@ -1,8 +1,8 @@
 """Contacts of planes, balls and capsules; a ball is a capsule of length zero.
 
-MJX has a function for each pair of types. Here all pairs with a plane share one formula, and all others another: forty pairs of
-a robot take as many operations as one. Distances, positions and normals agree with C MuJoCo. Tangents agree with MJX, and
-are also at right angles to the normal on tilted planes.
+All pairs with a plane share one formula, and all others another: forty pairs of a robot take as many operations as one.
+Distances, positions and normals agree with C MuJoCo. Tangents agree with MJX, but are at right angles to the normal on
+tilted planes, too.
 
 Nearest points of two segments, with unit axes a₁ and a₂ and centres r apart: the first line is nearest to the second at
 s = (a₂·r a₁·a₂ - a₁·r) / (1 - (a₁·a₂)²), and t = a₂·r + s a₁·a₂ is the point of the second line nearest to s. s is clamped
@@ -139,11 +139,5 @@ def _frames(normal: _Vectors, towards: _Vectors) -> _Frames:
     return jnp.stack([normal, tangent, cross(normal, tangent)], axis=1)
 
 
-def _products_table() -> np.ndarray:
-    """Return the table of a·b, a·c and b·c from (a, b) and (b, c)."""
-    table, eye = np.zeros((3, 6, 6)), np.eye(3)
-    table[0, :3, :3] = table[1, :3, 3:] = table[2, 3:, 3:] = eye
-    return table
-
-
-_products = Bilinear(_products_table())
+_products = Bilinear(np.kron([[[1, 0], [0, 0]], [[0, 1], [0, 0]], [[0, 0], [0, 1]]], np.eye(3)))
+"""a·b, a·c and b·c, from (a, b) and (b, c)."""

@@ -2,9 +2,8 @@
 
 Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`. Five more kinds of pair differ from MJX.
 
-A box on a plane. MJX searches corners within 1 mm of the deepest one. A tilted box loses corners that still touch, and its
-contacts change places as it turns. C MuJoCo and this library take the lower end of each of the four diagonals. No search is
-needed, and a contact always belongs to the same diagonal.
+A box on a plane. MJX takes corners within 1 mm of the deepest one, and loses others that still touch. C MuJoCo and this library
+take the lower end of each of the four diagonals, so a contact always belongs to the same diagonal.
 
 Two faces, one of them of a mesh. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
 For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.
@@ -249,39 +248,39 @@ def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.
 
 def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
     """Return contacts at the point of the cylinder nearest to the ball's centre; on the nearer of side and end if inside."""
-    sphere, cylinder = geoms.T
-    away = pick(sphere, data.geom_xpos) - pick(cylinder, data.geom_xpos)
-    centre = contract("pji,pj->pi", pick(cylinder, data.geom_xmat), away)
+    centre = _centre_in(data, geoms)
     radius = safe_norm(centre[:, :2])
     on_axis = (radius < 1e-12)[:, None]  # m; below it the radial direction's derivative overflows
     radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
     # Coordinates in the half-plane of axis and centre: radial, axial.
-    beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(cylinder, model.geom_size)[:, :2]
+    beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(geoms[:, 1], model.geom_size)[:, :2]
     sign = jnp.stack([jnp.ones_like(radius), jnp.where(centre[:, 2] < 0, -1.0, 1.0)], axis=1)
-    gap = sign * jnp.where(beyond > 0, beyond, 0.0)
-    length = safe_norm(gap)
-    is_inside = jnp.all(beyond <= 0, axis=1)
-    nearer = sign * (jnp.arange(2) == jnp.argmax(beyond, axis=1)[:, None])
-    outward = jnp.where(is_inside[:, None], nearer, gap / jnp.where(length > 0, length, 1.0)[:, None])
-    distance = jnp.where(is_inside, jnp.max(beyond, axis=1), length)
+    distance, outward = _from_faces(beyond, sign)
     outward = jnp.concatenate([outward[:, :1] * radial, outward[:, 1:]], axis=1)
     pos, frame = _towards(model, data, geoms, distance, outward)
-    return distance - pick(sphere, model.geom_size)[:, 0], pos, frame
+    return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
 
 
 def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
     """Return distance and direction of a ball's centre from a box, and its distances and signs along the axes."""
-    sphere, box = geoms.T
-    away = pick(sphere, data.geom_xpos) - pick(box, data.geom_xpos)
-    centre = contract("pji,pj->pi", pick(box, data.geom_xmat), away)
-    beyond = jnp.abs(centre) - pick(box, model.geom_size)
+    centre = _centre_in(data, geoms)
+    beyond, sign = jnp.abs(centre) - pick(geoms[:, 1], model.geom_size), jnp.where(centre < 0, -1.0, 1.0)
+    return *_from_faces(beyond, sign), beyond, sign
+
+
+def _centre_in(data: mjx.Data, geoms: _Pairs) -> _Points:
+    """Return the centre of the first geom in the frame of the second."""
+    away = pick(geoms[:, 0], data.geom_xpos) - pick(geoms[:, 1], data.geom_xpos)
+    return contract("pji,pj->pi", pick(geoms[:, 1], data.geom_xmat), away)
+
+
+def _from_faces(beyond: Float[Array, "pairs k"], sign: Float[Array, "pairs k"]) -> tuple[_PerPair, Array]:
+    """Return distance and direction of a point from a body with faces at right angles; from the nearest one if inside."""
     is_inside = jnp.all(beyond <= 0, axis=1)
-    sign = jnp.where(centre < 0, -1.0, 1.0)
     gap = sign * jnp.where(beyond > 0, beyond, 0.0)
-    length = safe_norm(gap)
-    face = sign * _largest(beyond)
-    outward = jnp.where(is_inside[:, None], face, gap / jnp.where(length > 0, length, 1.0)[:, None])
-    return jnp.where(is_inside, jnp.max(beyond, axis=1), length), outward, beyond, sign
+    length, nearest = safe_norm(gap), sign * _largest(beyond)
+    outward = jnp.where(is_inside[:, None], nearest, gap / jnp.where(length > 0, length, 1.0)[:, None])
+    return jnp.where(is_inside, jnp.max(beyond, axis=1), length), outward
 
 
 def _towards(
@@ -294,9 +293,9 @@ def _towards(
     return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
 
 
-def _largest(x: _Points) -> Array:
-    """Return whether each of three numbers is the largest."""
-    return jnp.arange(3) == jnp.argmax(x, axis=1)[:, None]
+def _largest(x: Float[Array, "pairs k"]) -> Array:
+    """Return whether each number of an item is the largest."""
+    return jnp.arange(x.shape[1]) == jnp.argmax(x, axis=1)[:, None]
 
 
 _FUNCTIONS = {

@@ -32,13 +32,7 @@ _HALVINGS = 50
 
 
 class Impedance(eqx.Module):
-    """Impedances of rows, as separate arrays, since two of the three do not depend on the state.
-
-    Attributes:
-        present: d(r), at the present violation.
-        full: dw, from the width on.
-        onset: d0, at r = 0.
-    """
+    """Impedances of rows: d(r) at the present violation, dw from the width on, and d0 at r = 0."""
 
     present: Float[Array, "*rows"]
     full: Float[Array, "*rows"]

@@ -120,16 +120,13 @@ def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
     """
     if int(model.opt.disableflags) & _DISABLES_CONTACT:
         return ()
-    return tuple(
-        ContactPair(
-            geom1=int(geom1),
-            geom2=int(geom2),
-            explicit=int(explicit),
-            condim=_condim(model, geom1, geom2, explicit),
-            names=(geom_name(model, int(geom1)), geom_name(model, int(geom2))),
-        )
-        for geom1, geom2, explicit in geom_pairs(model)
-    )
+    pairs = []
+    for geom1, geom2, explicit in (map(int, pair) for pair in geom_pairs(model)):
+        names = (geom_name(model, geom1), geom_name(model, geom2))
+        dims = [model.geom_condim[geom] for geom in _of_most_priority(model, geom1, geom2)]
+        condim = model.pair_dim[explicit] if explicit >= 0 else max(dims)
+        pairs.append(ContactPair(geom1, geom2, explicit, int(condim), names))
+    return tuple(pairs)
 
 
 def named_pairs(
@@ -178,12 +175,6 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
         solimp=solimp,
         timestep=jnp.asarray(model.opt.timestep),
     )
-
-
-def _condim(model, geom1, geom2, explicit) -> int:
-    if explicit >= 0:
-        return int(model.pair_dim[explicit])
-    return max(int(model.geom_condim[geom]) for geom in _of_most_priority(model, int(geom1), int(geom2)))
 
 
 def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: Array) -> Array:

@@ -29,12 +29,9 @@ from mjxgrad.contact.parameters import (
     named_pairs,
 )
 
-_PARTS = ("stiffness", "damping_ratio", "impedance", "width", "margin", "rest_acceleration")
 _Pairs = tuple[ContactPair, ...]
 # Plain integers: NumPy's integers do not equal MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
-
-
 _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "stiffness": (lambda x: (x > 0) & (x < np.inf), "positive and finite"),
     "damping_ratio": (lambda x: x >= 0, "at least 0"),
@@ -128,7 +125,7 @@ class Softness(eqx.Module):
                 pair that was not selected; if present values to be kept disagree; if a margin is set on a mesh or height
                 field; if a height is to be kept for a contact that already has a margin, without a given stiffness.
         """
-        for name in _PARTS:
+        for name in _REQUIREMENTS:
             shape = np.shape(getattr(self, name))
             if shape and not (name == "impedance" and shape == (2,)):
                 raise ValueError(
@@ -140,7 +137,7 @@ class Softness(eqx.Module):
         explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
         if self.margin is not None:
             model = _with_margin(model, self.margin, selected, list(explicit))
-        if all(getattr(self, name) is None for name in _PARTS if name != "margin"):
+        if all(getattr(self, name) is None for name in _REQUIREMENTS if name != "margin"):
             return model
         _refuse_shared_geoms(model, selected, functools.partial(deciding_geoms, model))
         # The pair of each geom to write.

@@ -111,11 +111,8 @@ class CartPole(Environment):
         place, speed = jax.random.split(key)
         spread = jnp.array([0.5, jnp.pi / 4])
         hanging = jnp.array([0.0, jnp.pi])
-        return initial_state(
-            self.scene,
-            hanging + spread * jax.random.uniform(place, (2,), minval=-1, maxval=1),
-            0.5 * jax.random.uniform(speed, (2,), minval=-1, maxval=1),
-        )
+        qpos = hanging + spread * jax.random.uniform(place, (2,), minval=-1, maxval=1)
+        return initial_state(self.scene, qpos, 0.5 * jax.random.uniform(speed, (2,), minval=-1, maxval=1))
 
     def observe(self, state: State, memory: PyTree) -> Float[Array, " 5"]:
         (place, angle), (speed, rate) = state.qpos, state.qvel

@@ -88,33 +88,18 @@ class Robot(Environment):
         return (model.body_mass * places).sum() / model.body_mass.sum()
 
 
+_PLANAR = {"frame_skip": 4, "control_weight": 1e-3, "alive_reward": 1.0, "speed_limit": 10.0, "noise": 5e-3}
+
+
 def hopper() -> Robot:
     """Return Hopper-v5: one leg, three motors, 8 ms an action."""
-    return Robot(
-        robot_scene("hopper"),
-        frame_skip=4,
-        control_weight=1e-3,
-        alive_reward=1.0,
-        healthy_height=(0.7, float("inf")),
-        healthy_angle=(-0.2, 0.2),
-        healthy_rest=100.0,
-        speed_limit=10.0,
-        noise=5e-3,
-    )
+    healthy = {"healthy_height": (0.7, float("inf")), "healthy_angle": (-0.2, 0.2), "healthy_rest": 100.0}
+    return Robot(robot_scene("hopper"), **healthy, **_PLANAR)
 
 
 def walker2d() -> Robot:
     """Return Walker2d-v5: two legs in a plane, six motors, 8 ms an action."""
-    return Robot(
-        robot_scene("walker2d_v5"),
-        frame_skip=4,
-        control_weight=1e-3,
-        alive_reward=1.0,
-        healthy_height=(0.8, 2.0),
-        healthy_angle=(-1.0, 1.0),
-        speed_limit=10.0,
-        noise=5e-3,
-    )
+    return Robot(robot_scene("walker2d_v5"), healthy_height=(0.8, 2.0), healthy_angle=(-1.0, 1.0), **_PLANAR)
 
 
 def half_cheetah() -> Robot:

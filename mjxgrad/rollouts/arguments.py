@@ -22,12 +22,6 @@ Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 Sees = Literal["state", "observations"]
 
 
-def check_policy_sees(policy_sees: str, observe: Observe | None) -> None:
-    """Refuse to show a policy observations that do not exist."""
-    if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
-        raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
-
-
 def sequence_of(
     controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
 ) -> tuple[Array | None, int]:

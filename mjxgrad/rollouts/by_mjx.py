@@ -1,8 +1,8 @@
 """A rollout by MJX: one checkpointed scan with a small carry, and failure flags."""
 
-import dataclasses
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -21,26 +21,10 @@ from mjxgrad.stepping import Contact, Onset, Smoothing, forward, step
 from mjxgrad.stepping.onset import reach
 
 
-class Settings(NamedTuple):
-    """Settings of a rollout: arguments of `rollout`, by the same names."""
-
-    policy_sees: Sees
-    checkpoint: bool
-    contact: Contact
-    measure_growth: bool
-
-
 class _Carry(NamedTuple):
-    """The carry of the scan.
+    """The carry of the scan: the last good state, what to count as in `Trajectory`, and the tangent that measures growth.
 
-    Attributes:
-        state: the last good state.
-        before: the previous control, under which a policy observes; None for a policy that sees the state.
-        first_bad: the first bad step, −1 so far.
-        unsolved: number of steps whose solve was cut short.
-        crowded: number of steps with too few contact slots.
-        tangent: tangent of positions and velocities that measures growth.
-        growth: largest norm of the tangent.
+    `before` is the previous control, under which a policy observes; None for a policy that sees the state.
     """
 
     state: State
@@ -52,19 +36,21 @@ class _Carry(NamedTuple):
     growth: Array | None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Scan:
-    """The loop over the steps of one rollout."""
+class Scan(eqx.Module):
+    """The loop over the steps of one rollout; its fields are arguments of `rollout`, by the same names."""
 
     scene: Scene
     policy: Policy | None
     params: PyTree
     observe: Observe | None
-    settings: Settings
+    policy_sees: Sees
+    checkpoint: bool
+    contact: Contact
+    measure_growth: bool
 
     def begin(self, state: State) -> _Carry:
         """Return the carry of the first step."""
-        looks = self.policy is not None and self.settings.policy_sees == "observations"
+        looks = self.policy is not None and self.policy_sees == "observations"
         # A NaN in the contacts of a traced model would go unnoticed.
         traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
@@ -74,13 +60,13 @@ class _Scan:
             jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)),
             jnp.zeros((), jnp.int32),
             jnp.zeros((), jnp.int32),
-            direction(state) if self.settings.measure_growth else None,
-            jnp.ones((), state.qvel.dtype) if self.settings.measure_growth else None,
+            direction(state) if self.measure_growth else None,
+            jnp.ones((), state.qvel.dtype) if self.measure_growth else None,
         )
 
     def advance(self, carry: _Carry, given: tuple[Array, Array, Array, dict]) -> tuple[_Carry, tuple]:
         """Take one step, and return the next carry and the outputs of this step."""
-        state, model, settings = carry.state, self.scene.model, self.settings
+        state, model = carry.state, self.scene.model
         index, row, disturbance, forces = given
         seen = None if carry.before is None else self.look(state, carry.before, forces)
         if self.policy is not None:
@@ -89,7 +75,7 @@ class _Scan:
         data = data_of(self.scene, state, ctrl).replace(**forces)
         tangent, growth = carry.tangent, carry.growth
         if tangent is None or growth is None:
-            stepped = step(model, data, contact=settings.contact)
+            stepped = step(model, data, contact=self.contact)
         else:
             stepped, tangent, growth = self.measure(data, tangent, growth)
         moved = state_of(stepped)
@@ -100,7 +86,7 @@ class _Scan:
             None if carry.before is None else ctrl.astype(carry.before.dtype),
             first_bad,
             carry.unsolved + ((first_bad < 0) & (stepped._impl.solver_niter > model.opt.iterations)),
-            carry.crowded + ((first_bad < 0) & _is_crowded(model, jax.lax.stop_gradient(stepped), settings.contact)),
+            carry.crowded + ((first_bad < 0) & _is_crowded(model, jax.lax.stop_gradient(stepped), self.contact)),
             tangent,
             growth,
         )
@@ -110,7 +96,7 @@ class _Scan:
         """Return the data after a step, the tangent there, and its largest norm so far."""
 
         def motion(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
-            stepped = step(self.scene.model, data.replace(qpos=qpos, qvel=qvel), contact=self.settings.contact)
+            stepped = step(self.scene.model, data.replace(qpos=qpos, qvel=qvel), contact=self.contact)
             return (stepped.qpos, stepped.qvel), stepped
 
         _, change, stepped = jax.jvp(motion, (data.qpos, data.qvel), tangent, has_aux=True)
@@ -124,31 +110,22 @@ class _Scan:
         model, data = self.scene.model, data_of(self.scene, state, ctrl).replace(**forces)
         has_stages = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         if stepped is None or has_stages:  # data of a multi-stage step belongs to its last stage
-            return self.observe(model, forward(model, data, contact=self.settings.contact))
+            return self.observe(model, forward(model, data, contact=self.contact))
         at_start = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
         return self.observe(model, stepped.replace(**at_start))
 
 
-def rolled_out(
-    scene: Scene,
-    state: State,
-    rows: tuple[Array, Array, dict[str, Array]],
-    policy: Policy | None,
-    params: PyTree,
-    observe: Observe | None,
-    settings: Settings,
-) -> Trajectory:
+def rolled_out(scan: Scan, state: State, rows: tuple[Array, Array, dict[str, Array]]) -> Trajectory:
     """Return the result of `rollout` for checked arguments; `rows` are controls, noise and inputs of each step."""
-    scan = _Scan(scene, policy, params, observe, settings)
-    advance = scan.advance
-    if settings.checkpoint:
+    advance = lambda carry, given: scan.advance(carry, given)  # noqa: E731 - a method of a pytree has no hash
+    if scan.checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
         # Inside a scan prevent_cse is needless: XLA cannot merge the recomputation with the forward pass.
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     first, steps = scan.begin(state), jnp.arange(len(rows[0]), dtype=jnp.int32)
     end, (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(advance, first, (steps, *rows))
     final, growth = end.state, end.growth
-    if observe is not None:
+    if scan.observe is not None:
         last = scan.look(final, ctrl[-1], jax.tree.map(lambda x: x[-1], rows[2]))
         observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)
     return Trajectory(

@@ -74,7 +74,8 @@ def rollout(
     native = arguments.native_motion(scene, contact)
     for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    arguments.check_policy_sees(policy_sees, observe)
+    if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
+        raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
     policy = controls if callable(controls) else None
     sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
     arguments.check_shapes(scene, state)
@@ -87,8 +88,9 @@ def rollout(
         given = (base + added if policy is None else policy, params, added, forces, native.gradient)
         return by_mujoco.rolled_out(scene, state, *given, measure_growth=measure_growth)
     rows = (base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
-    settings = by_mjx.Settings(policy_sees, checkpoint, contact, measure_growth)
-    given = (scene, state, rows, policy, params if policy is not None else None, observe, settings)
+    ways = (policy_sees, checkpoint, contact, measure_growth)
+    scan = by_mjx.Scan(scene, policy, params if policy is not None else None, observe, *ways)
     # Functions may read changing variables: every call traces them anew, unless the caller compiles.
     has_functions = policy is not None or observe is not None
-    return (by_mjx.rolled_out if has_functions or is_traced(given) else by_mjx.rolled_out_compiled)(*given)
+    is_part = has_functions or is_traced((scan, state, rows))
+    return (by_mjx.rolled_out if is_part else by_mjx.rolled_out_compiled)(scan, state, rows)

@@ -11,14 +11,12 @@ T = |u₁..|:
   (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
 
 Rows under noise (see `smoothing`) have the mean of these costs, at x + c w over noise w on the distance, where it makes
-contact. The mean of ½ min(x, 0)² is convex in x, with the derivative -`_mean_violation`. The cone is as simple: its three zones
-are the sum of two such terms,
+contact. The mean of ½ min(x, 0)² is convex in x, with the derivative -`_mean_violation`. A cone's cost is the sum of two such
+terms, of which the second vanishes in the middle and both at the top,
 
-    ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)):
+    ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)).
 
-at the top both vanish, in the middle the second does, at the bottom they add up to ½ Σ D x². Noise shifts N by μcw, so
-each term is the simple one with a spread of its own. This is exact, and convex. At T = 0 the tangential
-forces of the two terms cancel.
+Noise shifts N by μcw, so each term is the simple one with a spread of its own. At T = 0 their tangential forces cancel.
 
 Arrays may carry the batch as trailing axes, see `linear`.
 

@@ -4,6 +4,7 @@ Arrays may carry the batch as trailing axis, see `linear`. A CPU assembles the m
 batch. A GPU would move the matrices of many states to memory and back many times, so it uses a single kernel.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -16,8 +17,6 @@ from mjxgrad.solver.sparse import SparseRows
 
 _Vector = Float[Array, "nv *batch"]
 _Matrix = Float[Array, "nv nv *batch"]
-
-
 # Upper bound on the regularisation of an indefinite matrix, as a share of its diagonal.
 _MAX_SHIFT = 0.01
 
@@ -31,7 +30,7 @@ def solve(
         hessian = jacobian.gram(mass, layout, row_hessian)
         return cholesky.cholesky_solve(hessian, vector), linear.diagonal(hessian)
 
-    return _on_device(in_one_kernel, step_by_step, mass, jacobian, layout, row_hessian, vector)
+    return _on_device(in_one_kernel, step_by_step, layout, mass, jacobian, row_hessian, vector)
 
 
 def solve_regularised(
@@ -61,24 +60,21 @@ def solve_regularised(
     def at_once(*args):
         return in_one_kernel(*args, max_shift=_MAX_SHIFT)[0]
 
-    return _on_device(at_once, step_by_step, mass, jacobian, layout, row_hessian, vector)
+    return _on_device(at_once, step_by_step, layout, mass, jacobian, row_hessian, vector)
 
 
-def _on_device(at_once: Callable, step_by_step: Callable, mass, jacobian, layout: RowLayout, row_hessian, vector):
+def _on_device(at_once: Callable, step_by_step: Callable, layout: RowLayout, *system):
     """Solve by one kernel where kernels are available, else operation by operation."""
+    vector = system[-1]
     if vector.ndim == 2 and on_gpu.solves(layout.num_rows, len(vector)):
-        return device.by_platform(
-            *(mass, jacobian, row_hessian, vector),
-            gpu=lambda mass, jacobian, row_hessian, vector: at_once(mass, jacobian, layout, row_hessian, vector),
-            default=step_by_step,
-        )
-    return step_by_step(mass, jacobian, row_hessian, vector)
+        return device.by_platform(*system, gpu=functools.partial(at_once, layout), default=step_by_step)
+    return step_by_step(*system)
 
 
 def in_one_kernel(
+    layout: RowLayout,
     mass: Float[Array, "nv nv batch"],
     jacobian: SparseRows,
-    layout: RowLayout,
     row_hessian: RowHessian,
     vector: Float[Array, "nv batch"],
     *,

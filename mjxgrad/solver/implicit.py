@@ -11,10 +11,8 @@ gives no warning, since H and a do not move with p there.
 
 The residual g is evaluated without forming M and J: M a is the force that accelerates the bodies, J a the relative
 acceleration of two bodies. Reverse mode then passes through a few vectors per body and contact, not through a derivative of
-J. Only the solve and the factorisation of H need entries. Both are formed with the batch as trailing axis.
-
-The acceleration has a name for `jax.checkpoint`, see `cholesky.SOLUTION`. A rollout that recomputes its steps keeps this
-vector and skips the iterations.
+J. Only the solve and the factorisation of H need entries. The acceleration has a name for `jax.checkpoint`, see
+`cholesky.SOLUTION`.
 """
 
 import functools

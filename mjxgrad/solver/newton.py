@@ -7,25 +7,19 @@ Minimise over a
 with the laws s_i of `constraint`. The problem is strictly convex: the start affects the time taken, not the solution.
 
 **Line search.** Along a line the derivative of the cost is monotone and, without elliptic rows and noise, piecewise linear.
-Newton's method inside a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. (The values at
-all breakpoints give the minimiser without iterating, but take rows² work: three times slower at 24 rows.) Elliptic cones
-need the loop. Near the apex their curvature holds on one side only, so the minimiser may lie at a thousandth of the Newton
-step, and a step that was not checked may raise the cost.
+Newton's method inside a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. (Values at all
+breakpoints take rows² work: three times slower at 24 rows.) Near the apex of an elliptic cone the curvature holds on one side
+only. The minimiser may lie at a thousandth of the Newton step there, so its loop checks every step.
 
 **Convergence.** The solve ends by the Newton decrement gᵀ H⁻¹ g, the remaining step in the norm of kinetic energy. It does
-not depend on the units of joints or on the ratios of masses.
-
-The same steps solve a batch, operation by operation, and a single state in a GPU's program; `Problem` holds the difference.
-
-The gradient is formed anew in each iteration: in single precision an update along the line would keep rounding errors from
-a poor start.
+not depend on the units of joints or on the ratios of masses. The gradient is formed anew in each iteration: in single precision
+an update along the line would keep rounding errors from a poor start.
 """
 
-import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -146,63 +140,61 @@ class System:
         rows = eqx.tree_at(lambda rows: (rows.weight, rows.reference), self.rows, (variant.weight, reference))
         return dataclasses.replace(self, rows=rows, map=self.map.with_parts(variant.parts))
 
-    def problem(self, layout: RowLayout) -> "ArrayProblem":
+    def problem(self, layout: RowLayout) -> "Problem":
         """Return the problem with the entries of M and J; arrays may carry the batch as trailing axes."""
         jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
-        return ArrayProblem(self.force, self.rows, self.inertia.matrix, jacobian, layout)  # pyright: ignore[reportCallIssue]
+        return Problem(self.force, self.rows, self.inertia.matrix, jacobian, layout)
 
 
 class Problem(eqx.Module):
-    """The minimisation problem. Arrays carry the batch as trailing axes, or belong to the single state of a GPU's program.
+    """The minimisation problem, with the entries of M and J as arrays that may carry the batch as trailing axes.
 
-    Quantities of the rows are one array, or several in such a program.
+    `_KernelProblem` replaces the operations within a GPU's program. Quantities of the rows are one array, or several there.
     """
 
     force: _Vector
-    reference: eqx.AbstractVar[_OfRows]
-    weight: eqx.AbstractVar[_OfRows]
+    rows: Any  # `Rows`
+    mass: Float[Array, "nv nv *batch"]
+    jacobian: Any  # `SparseRows`
+    layout: RowLayout = eqx.field(static=True)
 
-    @abc.abstractmethod
     def mass_mv(self, acceleration: _Vector) -> _Vector:
         """Return M a."""
+        return linear.matvec(self.mass, acceleration)
 
-    @abc.abstractmethod
     def mv(self, acceleration: _Vector) -> _OfRows:
         """Return J a."""
+        return self.jacobian.matvec(acceleration)
 
-    @abc.abstractmethod
     def rmv(self, force: _OfRows) -> _Vector:
         """Return Jᵀ f."""
+        return self.jacobian.rmatvec(force)
 
-    @abc.abstractmethod
     def row_force(self, x: _OfRows) -> _OfRows:
         """Return the forces of the rows."""
+        return constraint.force(self.layout, self.rows, x)
 
-    @abc.abstractmethod
     def hessian_product(self, x: _OfRows, along: _OfRows) -> _OfRows:
         """Return the second derivative of the cost by x, times a vector."""
+        return constraint.curvature_product(self.layout, self.rows, x, along[:, None])[:, 0]
 
-    @abc.abstractmethod
     def newton(self, point: "Point") -> tuple[_Vector, _Vector]:
         """Return H⁻¹ times the gradient, not finite where H is not positive definite, and the diagonal of H."""
+        row_hessian = constraint.hessian(self.layout, self.rows, point.x)
+        return hessian.solve(self.mass, self.jacobian, self.layout, row_hessian, point.gradient)
 
     @property
-    @abc.abstractmethod
     def diagonal(self) -> _Vector:
         """The diagonal of M, positive."""
+        return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
 
-    @property
-    @abc.abstractmethod
-    def is_piecewise_quadratic(self) -> bool:
-        """Whether the cost along a line is piecewise quadratic."""
-
-    @abc.abstractmethod
     def is_finite(self, vector: _Vector) -> _Truth:
         """Return whether all entries of a vector are finite."""
+        return jnp.all(jnp.isfinite(vector), axis=0)
 
     def at(self, acceleration: _Vector) -> "Point":
         """Evaluate the problem at an acceleration."""
-        x = jax.tree.map(jnp.subtract, self.mv(acceleration), self.reference)
+        x = jax.tree.map(jnp.subtract, self.mv(acceleration), self.rows.reference)
         row_force = self.row_force(x)
         inertia, constraint_force = self.mass_mv(acceleration), self.rmv(row_force)
         return Point(acceleration, x, row_force, inertia, constraint_force, inertia - self.force - constraint_force)
@@ -217,7 +209,7 @@ class Problem(eqx.Module):
             size = jnp.abs(x) + jnp.abs(reference)
             return linear.dot(jnp.where(force != 0, weight, 0.0) * size, size)
 
-        rows = jax.tree.map(energy, point.x, self.reference, point.row_force, self.weight)
+        rows = jax.tree.map(energy, point.x, self.rows.reference, point.row_force, self.rows.weight)
         terms = linear.add([linear.dot(point.acceleration, point.inertia), *jax.tree.leaves(rows)])
         return (_ROUNDING * jnp.finfo(terms.dtype).eps) ** 2 * terms
 
@@ -231,69 +223,26 @@ class Problem(eqx.Module):
         return self.rounding(point) <= _RESOLVED**2 * (own + free)
 
 
-class ArrayProblem(Problem):
-    """A problem with the entries of M and J as arrays."""
-
-    rows: Rows
-    mass: Float[Array, "nv nv *batch"]
-    jacobian: SparseRows
-    layout: RowLayout = eqx.field(static=True)
-
-    def mass_mv(self, acceleration):
-        return linear.matvec(self.mass, acceleration)
-
-    def mv(self, acceleration):
-        return self.jacobian.matvec(acceleration)
-
-    def rmv(self, force):
-        return self.jacobian.rmatvec(force)
-
-    def row_force(self, x):
-        return constraint.force(self.layout, self.rows, x)
-
-    def hessian_product(self, x, along):
-        return constraint.curvature_product(self.layout, self.rows, x, along[:, None])[:, 0]
-
-    def newton(self, point):
-        row_hessian = constraint.hessian(self.layout, self.rows, point.x)
-        return hessian.solve(self.mass, self.jacobian, self.layout, row_hessian, point.gradient)
-
-    @property
-    def reference(self):
-        return self.rows.reference
-
-    @property
-    def weight(self):
-        return self.rows.weight
-
-    @property
-    def diagonal(self):
-        return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
-
-    @property
-    def is_piecewise_quadratic(self):
-        return self.layout.is_piecewise_quadratic
-
-    def is_finite(self, vector):
-        return jnp.all(jnp.isfinite(vector), axis=0)
-
-
 _Parts = tuple[Float[Array, " height"], *tuple[Float[Array, " width"], ...]]
 
 
+class _KernelRows(NamedTuple):
+    """Parameters of uncoupled rows, whose forces are -D x between bounds; parts as in `_KernelProblem`."""
+
+    reference: _Parts
+    weight: _Parts
+    low: _Parts
+    high: _Parts
+
+
 class _KernelProblem(Problem):
-    """A problem of uncoupled rows whose M and J a GPU's program keeps in registers; forces are -D x between bounds.
+    """A problem of uncoupled rows whose M and J a GPU's program keeps in registers.
 
     Quantities of the rows come in parts: one for the rows of J, and one by joint velocity for each group of rows that act on
     a single one, such as limits. As rows of J, whose number is a power of two, they would double it.
     """
 
-    reference: _Parts
-    weight: _Parts
-    mass: Float[Array, "width width"]
-    jacobian: Float[Array, "height width"]
     signs: tuple[Float[Array, " width"], ...]  # entries of the rows that act on one joint velocity
-    bounds: tuple[_Parts, _Parts]
     on_diagonal: _Vector
     refs: tuple[Any, Any]  # M and J in memory
     size: int = eqx.field(static=True)
@@ -314,7 +263,7 @@ class _KernelProblem(Problem):
             force = -weight * x
             return jnp.where(force < low, low, jnp.where(force > high, high, force))
 
-        return jax.tree.map(clipped, x, self.weight, *self.bounds)
+        return jax.tree.map(clipped, x, *self.rows[1:])
 
     def curvature(self, x: _Parts) -> _Parts:
         """Return the second derivative of the cost by x."""
@@ -323,7 +272,7 @@ class _KernelProblem(Problem):
             force = -weight * x
             return jnp.where((force > low) & (force < high), weight, 0.0)
 
-        return jax.tree.map(curvature, x, self.weight, *self.bounds)
+        return jax.tree.map(curvature, x, *self.rows[1:])
 
     def hessian_product(self, x, along):
         return jax.tree.map(jnp.multiply, self.curvature(x), along)
@@ -340,10 +289,6 @@ class _KernelProblem(Problem):
     @property
     def diagonal(self):
         return self.on_diagonal
-
-    @property
-    def is_piecewise_quadratic(self):
-        return True
 
     def is_finite(self, vector):
         return on_gpu.is_finite(vector)
@@ -408,14 +353,14 @@ def in_one_kernel(
     jacobian, rows = problem.jacobian, problem.rows
     dense_rows = jacobian.dense_rows()
     split = (jacobian.split(x) for x in (rows.reference, rows.weight, *constraint.bounds(layout, rows)))
-    by_row, structure = jax.tree.flatten((tuple(split), jacobian.signs()))
+    by_row, structure = jax.tree.flatten((_KernelRows(*split), jacobian.signs()))
     smallest = tolerance**2 * linear.add(problem.diagonal)
 
     def kernel(mass, jacobian, force, diagonal, start, smallest, *refs):
         *refs, acceleration, num_iterations = refs
-        (reference, weight, *bounds), signs = jax.tree.unflatten(structure, [ref[...] for ref in refs])
-        parts = (reference, weight, mass[...], jacobian[...], signs, tuple(bounds))
-        problem = _KernelProblem(force[...], *parts, diagonal[...], (mass, jacobian), size)
+        rows, signs = jax.tree.unflatten(structure, [ref[...] for ref in refs])
+        parts = (force[...], rows, mass[...], jacobian[...], layout, signs, diagonal[...])
+        problem = _KernelProblem(*parts, (mass, jacobian), size)
         solver = _Solver(problem, smallest[...], max_iterations)
         first = solver.measure(start[...], jnp.array(False), jnp.int32(0))
         acceleration[...], num_iterations[0] = solver.result(solver.run(first, 0))
@@ -563,7 +508,7 @@ def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Sca
     # The rows only add to the slope, so the inertial part alone bounds the root from above; twice that is outside.
     high = 2.0 * jnp.maximum(-start / jnp.where(smooth_curvature > 0, smooth_curvature, 1.0), 1.0)
     search = _Search(jnp.zeros_like(start), high, jnp.ones_like(start), is_done)
-    search = (_until_exact if problem.is_piecewise_quadratic else _until_flat)(improve, search)
+    search = (_until_exact if problem.layout.is_piecewise_quadratic else _until_flat)(improve, search)
     return jnp.where(search.is_flat | (search.low == 0), search.length, search.low)
 
 

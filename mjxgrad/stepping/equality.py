@@ -26,8 +26,8 @@ def blocks(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
     of_kinds = {
         kinds.mjEQ_CONNECT: _connect,
         kinds.mjEQ_WELD: _weld,
-        kinds.mjEQ_JOINT: _joint,
-        kinds.mjEQ_TENDON: _tendon,
+        kinds.mjEQ_JOINT: _coupling,
+        kinds.mjEQ_TENDON: _coupling,
     }
     for kind, rows in of_kinds.items():
         if (ids := np.nonzero(model.eq_type == kind)[0]).size:
@@ -159,33 +159,23 @@ def _polynomial(
     return value, slope
 
 
-def _coupling(
-    model: mjx.Model,
-    data: mjx.Data,
-    ids: np.ndarray,
-    positions: list[Array],
-    jacobians: list[Array],
-    weights: list[Array],
-) -> Block:
-    """Return rows x₁ - p(x₂) for pairs of scalar coordinates; without a second one x₂ = 0."""
+def _coupling(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
+    """Return rows x₁ - p(x₂) for pairs of joints or tendons; without a second one x₂ = 0."""
+    places = dofs = (model.eq_obj1id[ids], model.eq_obj2id[ids])
+    if model.eq_type[ids[0]] == mujoco.mjtEq.mjEQ_TENDON:
+        present, rest, entries, weights = (
+            data.ten_length,
+            model.tendon_length0,
+            data._impl.ten_J,
+            model.tendon_invweight0,
+        )
+    else:
+        places, dofs = ([table[joint] for joint in places] for table in (model.jnt_qposadr, model.jnt_dofadr))
+        present, rest, weights = data.qpos, model.qpos0, model.dof_invweight0
+        entries = jnp.eye(model.nv, dtype=data.qpos.dtype)
+    first, second = (present[place] - rest[place] for place in places)
     has_second = jnp.asarray(model.eq_obj2id[ids] >= 0, data.qpos.dtype)
-    value, slope = _polynomial(model.eq_data[ids][:, :5], positions[1] * has_second)
-    row = jacobians[0] - (slope * has_second)[:, None] * jacobians[1]
-    weight = (weights[0] + weights[1] * has_second)[:, None]
-    return _block(model, data, ids, row[:, None], (positions[0] - value)[:, None], weight)
-
-
-def _joint(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    addresses, dofs = ([table[joint] for joint in objects] for table in (model.jnt_qposadr, model.jnt_dofadr))
-    unit = jnp.eye(model.nv, dtype=data.qpos.dtype)
-    positions = [data.qpos[a] - model.qpos0[a] for a in addresses]
-    weights = [model.dof_invweight0[dof] for dof in dofs]
-    return _coupling(model, data, ids, positions, [unit[dof] for dof in dofs], weights)
-
-
-def _tendon(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
-    objects = (model.eq_obj1id[ids], model.eq_obj2id[ids])
-    positions = [data.ten_length[t] - model.tendon_length0[t] for t in objects]
-    weights = [model.tendon_invweight0[t] for t in objects]
-    return _coupling(model, data, ids, positions, [data._impl.ten_J[t] for t in objects], weights)
+    value, slope = _polynomial(model.eq_data[ids][:, :5], second * has_second)
+    row = entries[dofs[0]] - (slope * has_second)[:, None] * entries[dofs[1]]
+    weight = (weights[dofs[0]] + weights[dofs[1]] * has_second)[:, None]
+    return _block(model, data, ids, row[:, None], (first - value)[:, None], weight)

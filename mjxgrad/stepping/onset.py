@@ -1,9 +1,8 @@
 r"""Contact that begins within the step, so that the simulated motion has no jumps.
 
-MuJoCo decides once per step whether a contact or limit acts. The simulated outcome is therefore a sawtooth in the state: smooth
-while the same steps are in contact, with a jump where a step enters or leaves contact. Its derivative is the slope of a tooth.
-An event-driven simulator would start the contact at the time of impact: its motion has no teeth, and its derivative includes
-the saltation term. Here the step keeps its length, and takes the mean acceleration over it:
+MuJoCo decides once per step whether a contact or limit acts. The outcome is therefore a sawtooth in the state, with a jump where
+a step enters or leaves contact, and its derivative is the slope of a tooth. An event-driven simulator would start the contact at
+the time of impact. Here the step keeps its length, and takes the mean acceleration over it:
 
     a = ∫₀¹ a(contacts with φ > s) ds,        φ = clip(1/2 - r / w, 0, 1),        w = h |v|.
 
@@ -16,8 +15,8 @@ gymnasium's ant at 10 ms that shifts the mean by 6 mm, ten times the error of Mu
 **Consequences.** The solve is strictly convex and its weights are continuous in φ. So the whole step is a continuous function of
 state and parameters, for contacts, joint and tendon limits, all cones, at onset and at release. Hence:
 
-1. The plain derivative is unbiased by the fundamental theorem of calculus: its mean over any interval is the difference of the
-   outcome. No saltation term is needed, and no assumption on order, speed or duration of contacts.
+1. The mean of the plain derivative over any interval is the difference of the outcome. No saltation term is needed, and no
+   assumption on order, speed or duration of contacts.
 2. The ramp is centred at r = 0, where MuJoCo switches, so over the phase of a step the mean motion is MuJoCo's. Only the sawtooth
    is lost, an error of the time step. φ = 1 is MuJoCo's contact, φ = 0 is none. Bodies that rest, slide or stick deeper
    than w / 2 have φ = 1.
@@ -27,8 +26,7 @@ state and parameters, for contacts, joint and tendon limits, all cones, at onset
     a = (1 - Φ) a(p₋) + Φ a(p₊),        p₋ = max(0, (φ - Φ)/(1 - Φ)),        p₊ = min(1, φ/Φ),
 
 with Φ the mean of the partial φ, weighted by φ(1 - φ), so that a contact drops out as it begins or completes. If one contact is
-partial, or all have the same φ, p is 0 or 1 and this is the integral. Otherwise a contact with 0 < p < 1 acts with the
-impedance p d. The result is continuous, and the mean share is φ.
+partial, or all have the same φ, this is the integral. Otherwise a contact with 0 < p < 1 acts with the impedance p d.
 
 **Slow contacts.** The derivative by r is 1 / w, so where contacts graze or chatter w has a floor, w ≥ √(h²u² + w₀²):
 
@@ -36,20 +34,19 @@ impedance p d. The result is continuous, and the mean share is φ.
   approach. The edges n ± μ t of a sliding pyramid act with B μ |v_t| on touch, often many times the weight, and the body
   then rides on the ramp. So u grows by three times the speed that this force gains in a step, unless the approach is much faster
   than 2 g h: an impact.
-- Motors: a light foot pressed down with many times its weight is stopped and released again and again within a few steps. Each
-  time its tangent grows by about h Δa / u. So u gets a term of the same form for three times |J a| - g, with a the unconstrained
-  acceleration. It is smoothly bounded and adds at most 10 of the impedance's widths to w. It is zero for bodies that only
-  fall or roll.
+- Motors: a light foot pressed down with many times its weight is stopped and released within a few steps. Each time its tangent
+  grows by about h Δa / u. So u gets a term of the same form for three times |J a| - g, with a the unconstrained acceleration. It
+  adds at most 10 of the impedance's widths to w, and is zero for bodies that only fall or roll.
 - Chatter: w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Where contacts chatter (a body pushed along the
-  floor) each switch multiplies the tangent by about h Δa / w, which w₀ bounds at every time step. A larger w₀ gives a smoother
-  motion, farther from MuJoCo's. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, are not widened by it.
+  floor) each switch multiplies the tangent by about h Δa / w, which w₀ bounds. A larger w₀ gives a smoother motion, farther
+  from MuJoCo's. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, are not widened by it.
 
 Where w has its floor, r is taken ahead, r + h v (1 - h²v²/w²), which damps oscillations on the ramp.
 
 **Change of sides.** The normal flips where two centres pass each other along it (a ball driven through a thin wall). It turns by
-a right angle where another face of a box becomes the nearest to a ball's centre within the box. Both sides then act for a
-share of the step. The present side has ψ = 1/2 + δ / w, at most 1, with δ by how much it is nearer and w the change of δ in a
-step. The other side has the rest, at the same depth. This covers geoms with a centre of symmetry, and balls in boxes.
+a right angle where another face of a box becomes the nearest to a ball's centre within the box. The present side then acts for
+ψ = min(1, 1/2 + δ / w) of the step, the other side for the rest. Here δ is how much nearer the present side is, and w is how
+much δ changes in a step. This covers geoms with a centre of symmetry, and balls in boxes.
 
 **Limits.** True discontinuities remain: hit or miss, an edge that catches or not. So do jumps where two boxes change their
 touching faces, and where three faces of a box are equally near within a step. A contact shorter than about three steps is smooth
@@ -151,12 +148,7 @@ def _depth(solimp: Float[Array, "contacts 5"]) -> _PerContact:
 
 
 def _creep(
-    gravity: Float[Array, ""],
-    press: Float[Array, "..."],
-    h: Float[Array, ""],
-    stiffness: _PerContact,
-    damping: _PerContact,
-    depth: _PerContact,
+    gravity: Array, press: Array, h: Array, stiffness: _PerContact, damping: _PerContact, depth: _PerContact
 ) -> _PerContact:
     """Return the speed u below which gravity and pressing forces move bodies faster than they approach."""
     resistance = damping + safe_sqrt(stiffness)

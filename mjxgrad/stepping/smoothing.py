@@ -1,8 +1,7 @@
 r"""Contacts averaged over noise on their distance, in closed form, within the solver.
 
 Noise $w$ on the distance $r$ of a contact shifts its rows' reference acceleration, $a_\text{ref} = -B v - K d\,(r + w)$, and
-decides whether there is contact at all, $r + w < 0$. The mean of each row's cost over the noise is again convex and has a closed
-form, so the same solve finds the acceleration. The average is thus over the step's contact law, not over the motion.
+decides whether there is contact at all, $r + w < 0$. The average is over the step's contact law, not over the motion.
 
 As the length goes to zero the step tends to MuJoCo's own, gate included. A row without the gate
 would act wherever $J a - a_\text{ref} + K d w < 0$, touching or not, as in interior-point and barrier methods. Its damping
@@ -16,9 +15,8 @@ force is
 
 This is D c S(x/c) while x > c r, and its tangent at x = c r below that. Where x - c r is positive, a row releases before the
 bodies separate; where it is negative, a row acts until they do. The cost is a mean of convex functions of a, so the problem
-stays convex. The rows need only the two numbers of `constraint.Noise`: spread = c times length, and gate = c r. The edges of
-a pyramid share their noise, which changes nothing, since the mean of a sum is the sum of the means. For cones see
-`constraint`.
+stays convex, and the same solve finds the acceleration. The rows need two numbers, `constraint.Noise`: spread = c times length,
+and gate = c r. The edges of a pyramid share their noise. For cones see `constraint`.
 
 The weight D and c also depend on depth, through the impedance. They are taken at one depth, the mean of -(r + w) given that it
 is positive. For bodies in contact this tends to their depth as the length goes to zero. For separate bodies it is the mean

@@ -1,9 +1,8 @@
 """The differentiable step: MJX's stages in order, with our own rows, solve and integration.
 
-Drop-ins for `mjx.step`, `mjx.forward` and `mjx.solve` on any model and data of MJX's JAX implementation. Stages without work (no
-actuators, tendons, sensors or rows) are skipped when the program is traced. `jax.jit` removes unused results: camera poses, the
-unconstrained acceleration, the factor of the mass matrix. Therefore the solve starts from the last acceleration alone. MJX also
-evaluates the unconstrained one to choose the better start, which takes another factorisation.
+Stages without work (no actuators, tendons, sensors or rows) are skipped when the program is traced. `jax.jit` removes unused
+results: camera poses, the unconstrained acceleration, the factor of the mass matrix. Therefore the solve starts from the last
+acceleration alone. MJX also evaluates the unconstrained one, which takes another factorisation.
 
 Matrix products request full precision: NVIDIA GPUs otherwise round factors to ten bits, contact Jacobians included.
 """
@@ -45,9 +44,8 @@ def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
             "model and data must be of MJX's JAX implementation, got "
             f"{model.impl} and {data.impl}: create them with impl='jax'"
         )
-    if (
-        model.opt.solver == mujoco.mjtSolver.mjSOL_PGS
-    ):  # MJX lacks it; it marks the models of scenes that C MuJoCo steps
+    # MJX lacks this solver; it marks the models of scenes that C MuJoCo steps.
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
         raise ValueError("this model is of a scene that C MuJoCo steps, as scene.unsupported says: use mg.rollout")
     with jax.default_matmul_precision("highest"):
         yield

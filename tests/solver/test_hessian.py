@@ -44,9 +44,7 @@ def _problem(groups):
 def test_one_kernel_does_what_the_operations_do(groups):
     layout, (mass, jacobian, row_hessian, vector) = _problem(groups)
     kernel = functools.partial(hessian.in_one_kernel, interpret=jax.default_backend() != "gpu")
-    found, diagonal = jax.jit(lambda *args: kernel(args[0], args[1], layout, args[2], args[3]))(
-        mass, jacobian, row_hessian, vector
-    )
+    found, diagonal = jax.jit(functools.partial(kernel, layout))(mass, jacobian, row_hessian, vector)
     matrix = jacobian.gram(mass, layout, row_hessian)
     expected = np.linalg.solve(np.moveaxis(matrix, -1, 0), vector.T[..., None])[..., 0].T
     np.testing.assert_allclose(found, expected, rtol=1e-9)  # conditions up to 1e4
@@ -62,9 +60,7 @@ def test_one_kernel_mends_what_the_operations_mend():
     kernel = functools.partial(
         hessian.in_one_kernel, max_shift=hessian._MAX_SHIFT, interpret=jax.default_backend() != "gpu"
     )
-    found, _ = jax.jit(lambda *args: kernel(args[0], args[1], layout, args[2], args[3]))(
-        mass, jacobian, row_hessian, vector
-    )
+    found, _ = jax.jit(functools.partial(kernel, layout))(mass, jacobian, row_hessian, vector)
     expected = jax.jit(lambda *args: hessian.solve_regularised(args[0], args[1], layout, args[2], args[3]))(
         mass, jacobian, row_hessian, vector
     )
