@@ -316,6 +316,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             own = float(case(name).model.opt.timestep)
             for h in sorted({own, *settings.timesteps}, reverse=True):
                 courses.append(workspace.once(f"{name} {h}", lambda name=name, h=h: _course(name, h, settings)))
+                jax.clear_caches()  # no other motion takes its programs, and a process may have 65 530 pieces of memory
             advance_to(number + 1)
     return Outcome(courses)
 
