@@ -9,8 +9,7 @@ import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured
-from mjxgrad.checking.motions import Motions
-from mjxgrad.checking.moving import REFINED
+from mjxgrad.checking.motions import REFINED, Motions
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
 from mjxgrad.scene import Scene
@@ -93,8 +92,9 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
     if not scene.pairs:
         yield Finding("note", "No two geoms can touch, so all derivatives are those of smooth motion.")
     elif not motions.touches and not motions.touching:
+        seconds = motions.controls.shape[1] * motions.timestep
         text = (
-            f"Nothing touches within {motions.seconds:.3g} s, although {name_pairs(scene.pairs)} could: derivatives know of "
+            f"Nothing touches within {seconds:.3g} s, although {name_pairs(scene.pairs)} could: derivatives know of "
             "no contact. Start nearer, or take mg.Smoothing or a margin."
         )
         yield Finding("no_contact", text, True)
@@ -247,11 +247,6 @@ def recommend(
         stiffness=softer[0].stiffness if is_helped else None,
         max_contacts=max_contacts,
     )
-
-
-def touch_speed(motions: Motions) -> float | None:
-    """Return the largest approach speed at any first touch, in m/s."""
-    return max((touch.speed for touch in motions.touches if touch.speed > 0), default=None)
 
 
 def _steps_too_long(stability: StabilityReport) -> list[Spring]:
