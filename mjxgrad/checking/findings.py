@@ -104,7 +104,7 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         text = f"First to touch: {first.pair}, after {first.time:.3g} s at {first.speed:.2g} m/s{more}."
         yield Finding("note", text)
     else:
-        yield Finding("note", f"In contact from the start, and nothing else touches: {_some(motions.touching)}.")
+        yield Finding("note", f"In contact from the start, and nothing else touches: {name_pairs(motions.touching)}.")
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:
@@ -112,7 +112,8 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     jumps = [line for line in measured.lines if line.changed]
     if jumps:
         line = max(jumps, key=lambda one: float(one.jumps.sizes.max()))
-        text = f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side only."
+        pairs = name_pairs(line.changed)
+        text = f"The outcome jumps along a change of {line.varied}: {pairs} touches on one side only."
         yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", True)
     growth = np.array([line.growth for line in measured.lines])
     largest = float(np.nanmax(growth, initial=0.0))
@@ -296,8 +297,3 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
 def percent(share: float) -> str:
     """Return a share as text."""
     return "under 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" + {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more

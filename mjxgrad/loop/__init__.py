@@ -2,6 +2,6 @@
 
 from mjxgrad.loop.optimise import estimated_gradient, optimise
 from mjxgrad.loop.result import History, Optimisation, Stopped
-from mjxgrad.loop.run import Log, Method, run, side_by_side
+from mjxgrad.loop.run import Method, run, side_by_side
 
-__all__ = ["History", "Log", "Method", "Optimisation", "Stopped", "estimated_gradient", "optimise", "run", "side_by_side"]
+__all__ = ["History", "Method", "Optimisation", "Stopped", "estimated_gradient", "optimise", "run", "side_by_side"]

@@ -107,13 +107,9 @@ class Best(eqx.Module):
         Less smoothing wins first, because costs under different noise are not comparable. Then the larger share of finite
         rollouts wins, so that divergence does not pay; then the lower cost.
         """
-        is_better = (other.scale < self.scale) | (
-            (other.scale == self.scale)
-            & (
-                (other.finite_fraction > self.finite_fraction)
-                | ((other.finite_fraction == self.finite_fraction) & (other.cost < self.cost))
-            )
-        )
+        mine, theirs = self.finite_fraction, other.finite_fraction
+        is_better = jnp.where(theirs == mine, other.cost < self.cost, theirs > mine)
+        is_better = jnp.where(other.scale == self.scale, is_better, other.scale < self.scale)
         is_better = jnp.isfinite(other.cost) & (is_better | jnp.isnan(self.cost))
         return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
 
