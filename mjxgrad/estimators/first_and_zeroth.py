@@ -134,8 +134,7 @@ def zeroth_order_summary(samples: Samples) -> tuple[ScoreMoments, Moments, Array
     mask = samples.zeroth_order_mask()
     costs, scores = samples.rollouts.cost, samples.rollouts.noise_score
     moments = ScoreMoments.of(costs - samples.zero_noise_costs[:, None], scores, mask)
-    noise_free_cost = jnp.where(samples.is_noise_free, costs[:, 0], 0).sum()  # of one chunk alone
-    return moments, Moments.of(costs.mean(axis=1), mask), noise_free_cost, samples.num_felt()
+    return moments, Moments.of(costs.mean(axis=1), mask), samples.noise_free_cost(), samples.num_felt()
 
 
 def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, restore: Callable) -> GradientEstimate:

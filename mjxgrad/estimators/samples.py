@@ -129,6 +129,10 @@ class Samples(eqx.Module):
         is_finite = all_finite(self.rollouts.cost) & all_finite(self.rollouts.noise_score)
         return self.is_noisy & is_finite & jnp.isfinite(self.zero_noise_costs)
 
+    def noise_free_cost(self) -> Scalar:
+        """Return the cost without noise if it is in this chunk, else zero."""
+        return jnp.where(self.is_noise_free, self.rollouts.cost[:, 0], 0).sum()
+
     def num_felt(self) -> Int[Array, ""]:
         """Return the number of units whose noise made a difference, or cannot tell."""
         return (self.is_noisy & ~self.has_no_effect).sum()
