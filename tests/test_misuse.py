@@ -56,10 +56,6 @@ def zeroth(estimator=estimators.zeroth_order, **how):
     return estimator(noisy, params, key, **how)
 
 
-def shared(**how):
-    return zeroth(estimators.first_and_zeroth_order, **how)
-
-
 def elite(count, **how):
     return mg.baselines.cross_entropy(noisy, params, key, num_samples=8, num_elite=count, num_steps=2, **how)
 
@@ -233,10 +229,10 @@ FOUND = {
     # Objectives and estimators.
     "first(count=1)": "num_samples must be at least 2, got 1",
     "zeroth(num_samples=-3)": "num_samples must be at least 2, got -3",
-    "shared(num_samples=8, chunk_size=0)": "chunk_size must be at least 1, got 0",
+    "zeroth(num_samples=8, chunk_size=0)": "chunk_size must be at least 1, got 0",
     "zeroth(num_samples=7, antithetic=True)": "num_samples must be even with antithetic pairs, got 7",
-    "shared(num_samples=2, antithetic=True)": "num_samples must be at least 4 with antithetic pairs, got 2",
-    "shared(num_samples=8, baseline='mean')": "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'",
+    "zeroth(num_samples=2, antithetic=True)": "num_samples must be at least 4 with antithetic pairs, got 2",
+    "zeroth(num_samples=8, baseline='mean')": "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'",
     "first(objective=mg.parameter_noise(jnp.sum, 0.1, dim=1))": "params must have shape (1,), got (2,)",
     "first(at={'force': 1})": "params must have floating-point arrays",
     "mg.parameter_noise(jnp.sum, 0.0)": "stddev must be positive, got",

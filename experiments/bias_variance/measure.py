@@ -20,7 +20,7 @@ from experiments.motion import own_task
 from experiments.theme import power
 from experiments.words import percent
 from experiments.workspace import Workspace
-from mjxgrad.checking.moving import compiler_options
+from mjxgrad.checking.motions import compiler_options
 from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.objective import Objective, parameter_noise

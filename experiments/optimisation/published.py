@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from experiments.problems import published
-from mjxgrad.objective import ActionNoise, closed_loop, open_loop
-from mjxgrad.objective.policy import linear_policy
+from mjxgrad.objective import ActionNoise, closed_loop, linear_policy, open_loop
 
 Schedule = Callable[[Int[Array, ""] | int], Float[Array, ""] | float]
 

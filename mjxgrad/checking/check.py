@@ -1,7 +1,6 @@
 """One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
 import contextlib
-import dataclasses
 import os
 import textwrap
 import time
@@ -19,8 +18,7 @@ from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Measured, Noise, measure
-from mjxgrad.checking.motions import Motions, first_keyframe, half_range, most_contacts, random_motions
-from mjxgrad.checking.moving import Mover, Outcomes
+from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.report import Block, page
 from mjxgrad.scene import Scene, SceneWarning, load_scene
@@ -80,10 +78,11 @@ class Verdict:
 
     def _details(self) -> dict[str, str]:
         """Return the detailed report: measurements, scene, time step."""
-        of_what = [] if self.measured is None else [f"Outcomes: {'; '.join(self.outcomes)}."]
-        noises = [] if self.measured is None else map(_noise_text, self.measured.noises)
+        lines = ["Nothing."]
+        if self.measured:
+            lines = [f"Outcomes: {'; '.join(self.outcomes)}.", *map(_noise_text, self.measured.noises)]
         return {
-            "What was measured": "\n".join([*of_what, *noises]) or "Nothing.",
+            "What was measured": "\n".join(lines),
             "The scene": self.scene.summary(),
             "Time step and contacts": self.stability.summary(),
         }
@@ -136,12 +135,11 @@ def check(
     rng = np.random.default_rng(seed)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scene, path = _load(source)
+        scene = source if isinstance(source, Scene) else load_scene(source)
         cost = named_cost(scene, cost) if isinstance(cost, str) else cost
         started = time.perf_counter()
         motions = random_motions(scene, rng)
-        scene, max_contacts = _with_room(scene, motions)
-        stability = check_stability(scene, speed=findings.touch_speed(motions))
+        stability = check_stability(scene, speed=motions.touch_speed or None)
     found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
@@ -151,11 +149,13 @@ def check(
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
         with contextlib.suppress(TimeoutError):
-            given = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
-            measured = measure(scene, motions, mover, rng, **given)
+            measured = measure(
+                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
+            )
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
-    advice = findings.recommend(scene, motions, stability, measured, max_contacts)
+    advice = findings.recommend(scene, motions, stability, measured, _max_contacts(scene, motions))
+    path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,
         headline=findings.headline(found, advice, motions),
@@ -170,38 +170,24 @@ def check(
     )
 
 
-def _load(source: Source) -> tuple[Scene, str]:
-    """Return the scene, and the name of its file in code."""
-    if isinstance(source, Scene):
-        return source, "scene.xml"
-    is_text = isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<")
-    is_file = isinstance(source, str | os.PathLike) and not is_text
-    return load_scene(source), str(source) if is_file else "scene.xml"
-
-
-def _with_room(scene: Scene, motions: Motions) -> tuple[Scene, int | None]:
-    """Return the scene with fewer contact slots, if motions needed far fewer than all."""
-    if not scene.pairs:
-        return scene, None
-    needed = most_contacts(scene, motions.qpos)
-    # Motions along lines may have more contacts than these.
-    room = 2 * needed + _SPARE_CONTACTS
-    if scene.data._impl.ncon <= max(2 * room, _MANY_CONTACTS):
-        return scene, None
-    return dataclasses.replace(scene, data=load_scene(scene.to_mujoco(), max_contacts=room).data), room
+def _max_contacts(scene: Scene, motions: Motions) -> int | None:
+    """Return a number of contact slots to set, if motions needed far fewer than all."""
+    # Other motions may have more contacts than these.
+    room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
+    return room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
 
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
     """Yield what the library warned of, without the scene's name; of other libraries' warnings the first of each kind."""
-    own = dict.fromkeys(str(one.message).partition(": ")[2] for one in caught if issubclass(one.category, SceneWarning))
+    own: dict[str, None] = {}
+    by_line: dict[tuple[str, int], set[str]] = {}
+    for one in caught:
+        if issubclass(one.category, SceneWarning):
+            own[str(one.message).partition(": ")[2]] = None
+        elif issubclass(one.category, UserWarning):
+            by_line.setdefault((one.filename, one.lineno), set()).add(str(one.message))
     # A separate finding tells where the time step is too long.
     texts = [text for text in own if "refsafe" not in text and "h²k" not in text]
-    others = [
-        one for one in caught if issubclass(one.category, UserWarning) and not issubclass(one.category, SceneWarning)
-    ]
-    by_line: dict[tuple[str, int], set[str]] = {}
-    for one in others:
-        by_line.setdefault((one.filename, one.lineno), set()).add(str(one.message))
     for messages in by_line.values():
         first, *more = sorted(messages)
         texts.append(first.rstrip(".") + (f" ({len(more)} more alike)" if more else ""))

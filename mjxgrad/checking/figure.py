@@ -47,24 +47,20 @@ def _most_telling(measured: Measured) -> tuple[Line, int, int]:
 
 
 def _panel(x: np.ndarray, jumps: np.ndarray, what: str, fine: str, curve: np.ndarray, dots: dict[str, tuple]) -> Any:
-    """Draw dots by name, colour and marker over a grey curve; dots beyond its range lie on the edge."""
+    """Draw dots by name, colour and marker over a grey curve; of several kinds, those beyond its range lie on the edge."""
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=_SIZE)
     axis.plot(x, curve, color="#8b94a1", lw=1.4, label=fine)
-    low, high = _range(curve if len(dots) > 1 else np.concatenate([curve, *(values for values, *_ in dots.values())]))
+    axis.margins(y=1 / 3)
+    low, high = -np.inf, np.inf
+    if len(dots) > 1:  # beside other derivatives the slope sets the range
+        low, high = axis.get_ylim()
+        axis.set_autoscaley_on(False)
     for name, (values, colour, marker) in dots.items():
         axis.plot(x, np.clip(values, low, high), marker, color=colour, ms=3, mew=0, label=name, clip_on=False)
     for place in jumps:
         axis.axvline(place, color="#8b94a1", lw=1, ls="--")
-    axis.set(xlabel="place on the line, −1 to 1", ylabel=what, ylim=(low, high))
+    axis.set(xlabel="place on the line, −1 to 1", ylabel=what)
     figure.legend(loc="outside upper right", ncols=3)
     return figure
-
-
-def _range(values: np.ndarray) -> tuple[float, float]:
-    """Return the range of the finite values, widened by a third and never empty."""
-    values = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
-    low, high = float(values.min()), float(values.max())
-    room = (high - low) / 3 if high > low else max(abs(low), 1e-9)
-    return low - room, high + room

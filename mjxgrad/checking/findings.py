@@ -9,8 +9,7 @@ import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured
-from mjxgrad.checking.motions import Motions
-from mjxgrad.checking.moving import REFINED
+from mjxgrad.checking.motions import REFINED, Motions
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
 from mjxgrad.scene import Scene
@@ -93,8 +92,9 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
     if not scene.pairs:
         yield Finding("note", "No two geoms can touch, so all derivatives are those of smooth motion.")
     elif not motions.touches and not motions.touching:
+        seconds = motions.controls.shape[1] * motions.timestep
         text = (
-            f"Nothing touches within {motions.seconds:.3g} s, although {name_pairs(scene.pairs)} could: derivatives know of "
+            f"Nothing touches within {seconds:.3g} s, although {name_pairs(scene.pairs)} could: derivatives know of "
             "no contact. Start nearer, or take mg.Smoothing or a margin."
         )
         yield Finding("no_contact", text, True)
@@ -104,7 +104,7 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         text = f"First to touch: {first.pair}, after {first.time:.3g} s at {first.speed:.2g} m/s{more}."
         yield Finding("note", text)
     else:
-        yield Finding("note", f"In contact from the start, and nothing else touches: {_some(motions.touching)}.")
+        yield Finding("note", f"In contact from the start, and nothing else touches: {name_pairs(motions.touching)}.")
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:
@@ -112,7 +112,8 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     jumps = [line for line in measured.lines if line.changed]
     if jumps:
         line = max(jumps, key=lambda one: float(one.jumps.sizes.max()))
-        text = f"The outcome jumps along a change of {line.varied}: {_some(line.changed)} touches on one side only."
+        pairs = name_pairs(line.changed)
+        text = f"The outcome jumps along a change of {line.varied}: {pairs} touches on one side only."
         yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", True)
     growth = np.array([line.growth for line in measured.lines])
     largest = float(np.nanmax(growth, initial=0.0))
@@ -249,11 +250,6 @@ def recommend(
     )
 
 
-def touch_speed(motions: Motions) -> float | None:
-    """Return the largest approach speed at any first touch, in m/s."""
-    return max((touch.speed for touch in motions.touches if touch.speed > 0), default=None)
-
-
 def _steps_too_long(stability: StabilityReport) -> list[Spring]:
     """Return the springs for which the time step is too long, one of each group of equal ones."""
     found = [one for one in stability.springs if _largest_step(one) < one.timestep * (1 - 1e-6)]
@@ -301,8 +297,3 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
 def percent(share: float) -> str:
     """Return a share as text."""
     return "under 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" + {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more

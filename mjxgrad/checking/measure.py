@@ -11,8 +11,19 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._text import format_number
-from mjxgrad.checking.motions import Motions, half_range, pairs_at, smooth
-from mjxgrad.checking.moving import KINDS, REFINED, Direction, Kind, Moved, Mover, moved
+from mjxgrad.checking.motions import (
+    KINDS,
+    REFINED,
+    Direction,
+    Kind,
+    Motions,
+    Moved,
+    Mover,
+    half_range,
+    moved,
+    pairs_at,
+    smooth,
+)
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
@@ -95,7 +106,6 @@ class Measured:
     """All measurements, and the names of those left out for lack of time; times of outcomes after the start, in s."""
 
     times: Float[np.ndarray, " times"]
-    num_steps: int
     lines: tuple[Line, ...]
     noises: tuple[Noise, ...]
     left_out: tuple[str, ...] = ()
@@ -122,8 +132,7 @@ def measure(
     log(f"derivatives over {num_steps} steps, {num_steps * motions.timestep:.3g} s, from motions that touch")
     probe = _Probe(scene, motions, mover, lengths)
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
-    speed = max((touch.speed for touch in motions.touches), default=0.0) or 1.0
-    directions = [_direction(scene, rng, num_steps, speed, i) for i in range(_NUM_LINES)]
+    directions = [_direction(scene, rng, num_steps, motions.touch_speed or 1.0, i) for i in range(_NUM_LINES)]
     softer = [SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))] if scene.pairs else []
     settings = [(stddev, soft) for soft in [None, *softer] for stddev in STDDEVS]
     asked: list[tuple[str, int, Callable[[], Line | Noise]]] = [
@@ -152,7 +161,6 @@ def measure(
             left_out.append(words)
     return Measured(
         np.array(lengths) * motions.timestep,
-        num_steps,
         tuple(one for one in found if isinstance(one, Line)),
         tuple(one for one in found if isinstance(one, Noise)),
         tuple(left_out),
@@ -226,6 +234,7 @@ class _Probe:
         plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own[0], fine))
         centre = np.nanmean(fine.outcomes[:, -1], axis=0)
         # Outcomes at rest vary by rounding alone.
+        moves_start = direction.positions.any() or direction.velocities.any()
         is_moving = is_felt[-1] & (spreads[-1] > _AT_REST * spreads.max(axis=0))
         scale = np.where(is_moving, spreads[-1], np.inf)
         jumps = jumps_along(
@@ -243,7 +252,7 @@ class _Probe:
             fine=shorter,
             jumps=jumps,
             changed=self._changed(state, controls, direction, jumps),
-            growth=np.median(own[0].growth, axis=0) if direction.moves_start else np.full(len(self.lengths), np.nan),
+            growth=np.median(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan),
             num_diverged=sum(one.num_diverged for one in (own[0], fine)),
         )
 
@@ -315,5 +324,4 @@ def crossing(
     last = int(np.flatnonzero(log_ratio < 0)[-1])
     if last == len(times) - 1:
         return np.inf
-    below, above = log_ratio[last], log_ratio[last + 1]
-    return float(times[last] - below / (above - below) * (times[last + 1] - times[last]))
+    return float(np.interp(0.0, log_ratio[last : last + 2], times[last : last + 2]))

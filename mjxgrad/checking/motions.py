@@ -1,21 +1,30 @@
-"""Random motions of a scene in C MuJoCo, which needs no compilation, and the contacts in them.
+"""Motions of a scene in C MuJoCo, which needs no compilation: random ones, and batches with derivatives along a direction.
 
-They come first because they take a second and locate the expensive measurements: just before a first touch.
+Random motions come first because they take a second and locate the expensive measurements: just before a first touch.
 """
 
-from collections.abc import Iterator
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Float, Int
+import scipy.interpolate
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from mjxgrad.batched import device
 from mjxgrad.contact import Softness
 from mjxgrad.contact.parameters import geom_name
+from mjxgrad.native.derivative import to_coordinates
 from mjxgrad.native.engine import engine_of
-from mjxgrad.rollouts import State
+from mjxgrad.objective.task import finite_cost
+from mjxgrad.rollouts import State, Trajectory
 from mjxgrad.rollouts.state import VELOCITY_LIMIT, pose_warnings
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
@@ -29,7 +38,13 @@ _REACH = 0.8  # share of half the range, so that small changes are not clipped
 _REPLAYED = 100  # steps before and after the first touch, within which effects show
 _SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding in double precision over these steps
 _CLEARANCE = 0.01  # m, beyond the margin: a nearer pair may touch in similar motions
+Kind = Literal["slope", "discrete", "fine"]
+KINDS: tuple[Kind, ...] = ("slope", "discrete")
+"""Kind of derivative of MuJoCo's motion; "fine" is the motion at a `REFINED` times shorter time step, without derivatives."""
+REFINED = 4
+CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 _States = dict[str, Any]  # qpos, qvel and act, with leading axes
+Outcomes = Callable[[Trajectory], Float[Array, " outcomes"]]
 
 
 @dataclass(frozen=True)
@@ -72,9 +87,9 @@ class Motions:
     idle: tuple[str, ...]
 
     @property
-    def seconds(self) -> float:
-        """The duration of each motion, in s."""
-        return self.controls.shape[1] * self.timestep
+    def touch_speed(self) -> float:
+        """The largest speed of approach at any first touch, in m/s; zero without one."""
+        return max((touch.speed for touch in self.touches), default=0.0)
 
     def state(self, motion: int, step: int) -> State:
         """Return the state of a motion after a number of steps."""
@@ -91,10 +106,7 @@ def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
 def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: float) -> Float[np.ndarray, "steps nu"]:
     """Draw numbers between −1 and 1 that are piecewise linear in time between a few random knots."""
     knots = rng.uniform(-1, 1, (max(2, round(_KNOTS_PER_SECOND * seconds) + 1), num_columns))
-    at = np.linspace(0, len(knots) - 1, num_steps)
-    lower = np.minimum(at.astype(int), len(knots) - 2)
-    share = (at - lower)[:, None]
-    return (1 - share) * knots[lower] + share * knots[lower + 1]
+    return scipy.interpolate.make_interp_spline(np.linspace(0, 1, len(knots)), knots, k=1)(np.linspace(0, 1, num_steps))
 
 
 def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
@@ -233,3 +245,132 @@ def _idle(scene: Scene, start: _States, controls: Float[np.ndarray, "steps nu"],
     effects = [np.abs(path[name][1:] - path[name][:1]).max(axis=(1, 2)) for name in ("qpos", "qvel")]
     idle = np.flatnonzero(np.maximum(*effects) < _SMALLEST_EFFECT).tolist()
     return tuple(element_name(scene.mj_model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in idle)
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A change of a motion: of its initial positions (m, rad) and velocities (m/s, rad/s), and of its controls."""
+
+    positions: Float[np.ndarray, " nv"]
+    velocities: Float[np.ndarray, " nv"]
+    controls: Float[np.ndarray, "steps nu"]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Outcomes of a batch of motions at several times, and their derivatives along a direction; NaN for those that diverged.
+
+    `growth` is the growth of the tangent of the state relative to the start.
+    """
+
+    outcomes: Float[np.ndarray, "motions times outcomes"]
+    derivatives: Float[np.ndarray, "motions times outcomes"]
+    growth: Float[np.ndarray, "motions times"]
+    num_diverged: int
+
+    def where(self, is_felt: Bool[np.ndarray, "times outcomes"]) -> "Moved":
+        """Return the same with insensitive outcomes as constants: rounding has jumps and slopes of its own."""
+        mean = np.nansum(self.outcomes, axis=0) / np.maximum(np.isfinite(self.outcomes).sum(axis=0), 1)
+        kept = is_felt | np.isnan(self.outcomes)
+        return dataclasses.replace(self, outcomes=np.where(kept, self.outcomes, mean))
+
+
+@dataclass
+class Mover:
+    """Simulator of batches of `size` motions in a scene; none starts later than `end`, by `time.perf_counter`."""
+
+    scene: Scene
+    size: int
+    outcomes: Outcomes
+    end: float = math.inf
+
+    def __post_init__(self):
+        self._judges: dict[tuple[int, ...], Callable] = {}
+        self._num_steps, self._seconds = 0, 0.0
+
+    @property
+    def step_seconds(self) -> float:
+        """The mean duration of a step of a batch so far."""
+        return self._seconds / max(self._num_steps, 1)
+
+    def move(
+        self,
+        kind: Kind,
+        states: State,
+        controls: Float[np.ndarray, "motions steps nu"],
+        direction: Direction,
+        lengths: Sequence[int],
+        softness: Softness | None = None,
+    ) -> Moved:
+        """Simulate a batch with its tangent along a direction, and return the outcomes after the given steps.
+
+        Raises:
+            TimeoutError: after `end`.
+        """
+        if time.perf_counter() > self.end:
+            raise TimeoutError
+        start = {k: np.asarray(getattr(states, k), float) for k in ("qpos", "qvel", "act")}
+        num, steps = len(controls), lengths[-1]
+        controls = np.asarray(controls, float)[:, :steps]
+        pushes = np.broadcast_to(direction.controls[:steps], controls.shape)
+        change = np.concatenate([direction.positions, direction.velocities, np.zeros(start["act"].shape[1])])
+        follow = None if kind == "fine" else (kind, (np.tile(change, (num, 1)), pushes))
+        refined = REFINED if kind == "fine" else 1
+        started = time.perf_counter()
+        found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)
+        self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
+        course = found.pop("change", np.full((num, steps, len(change)), np.nan))
+        path, bad_steps = held({name: x[:, ::refined] for name, x in found.items()})
+        bad = bad_steps >= 0
+        course = np.concatenate([np.tile(change, (num, 1, 1)), np.where(bad[:, None, None], 0.0, course)], axis=1)
+        outcomes, derivatives = self._judge(tuple(lengths))(bad, (*path.values(), controls), course, pushes)
+        growth = np.linalg.norm(course[:, list(lengths)], axis=2) / (np.linalg.norm(change) or 1.0)
+        return Moved(np.asarray(outcomes), np.asarray(derivatives), growth, int(bad.sum()))
+
+    def _judge(self, lengths: tuple[int, ...]) -> Callable:
+        """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""
+        if lengths in self._judges:
+            return self._judges[lengths]
+        nv = self.scene.model.nv
+
+        def at(length: int, bad: Array, qpos: Array, qvel: Array, act: Array, controls: Array) -> Array:
+            trajectory = Trajectory(
+                qpos[: length + 1],
+                qvel[: length + 1],
+                controls[:length],
+                observations=None,
+                final=State(qpos[length], qvel[length], act[length], jnp.zeros(()), jnp.zeros_like(qvel[0])),
+                diverged=bad,
+                first_bad_step=jnp.where(bad, 0, -1),
+                act=act[: length + 1],
+            )
+            return jax.vmap(lambda one: finite_cost(one, trajectory))(self.outcomes(trajectory))
+
+        def one(bad: Array, motion: tuple[Array, ...], course: Array, pushes: Array) -> tuple[Array, Array]:
+            parts = jnp.split(course, (nv, 2 * nv), axis=1)
+            parts[0] = jax.vmap(functools.partial(to_coordinates, self.scene))(motion[0], parts[0])
+            outcomes = lambda *motion: jnp.stack([at(length, bad, *motion) for length in lengths])  # noqa: E731
+            return jax.jvp(outcomes, motion, (*parts, pushes))
+
+        return self._judges.setdefault(lengths, jax.jit(jax.vmap(one)))
+
+
+def moved(
+    model: mujoco.MjModel,
+    qpos: Float[ArrayLike, "motions nq"],
+    positions: Float[np.ndarray, " nv"],
+    places: Float[np.ndarray, " motions"] | float,
+) -> Float[np.ndarray, "motions nq"]:
+    """Return poses moved along a change of positions, with quaternions by the exponential map."""
+    found = np.array(qpos, float)
+    for one, place in zip(found, np.broadcast_to(places, len(found)), strict=True):
+        mujoco.mj_integratePos(model, one, positions, float(place))
+    return found
+
+
+def compiler_options() -> dict | None:
+    """Return options that halve XLA's compile time, where known."""
+    if not device.is_cpu() or jax.__version_info__ >= (0, 11):
+        return None
+    # XLA's optimisation level 1 halves the time to compile (hopper, jax 0.10.2: 12 s in place of 24); the code is as fast.
+    return {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}

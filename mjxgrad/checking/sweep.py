@@ -17,8 +17,7 @@ from mjxgrad._arrays import is_known
 from mjxgrad._text import format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
-from mjxgrad.checking.motions import half_range
-from mjxgrad.checking.moving import CONTACT_FIELDS, compiler_options
+from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES

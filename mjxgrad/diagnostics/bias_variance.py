@@ -376,7 +376,7 @@ def _program(
         samples_key, reference_key = jax.random.split(key)
         by_noise = _sampled(objective, params, samples_key, plan)
         samples = jax.vmap(_by_parameters)(by_noise) if plan.by_noise else by_noise
-        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, "leave_one_out", unchanged))(samples)
+        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, unchanged))(samples)
         mixed = (None, None)
         if has_alpha:
             mixed = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)

@@ -8,7 +8,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, ScoreMoments, as_real
-from mjxgrad.estimators.samples import Plan, Samples, plan_for_baseline, stream
+from mjxgrad.estimators.samples import Plan, Samples, all_finite, check_baseline, stream
 from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Vector
 
@@ -78,34 +78,37 @@ def zeroth_order(
         samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
     objective, vector, restore = as_vector(objective, params)
-    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline)
+    check_baseline(baseline)
+    is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
+    plan = Plan(
+        num_samples,
+        chunk_size,
+        antithetic,
+        with_score=True,
+        with_zero_noise=is_needed and not has_own,
+        zero_noise_per_unit=is_needed and has_own,
+    )
     return zeroth_order_result(stream(objective, vector, key, plan, zeroth_order_summary), plan, baseline, restore)
 
 
 def first_and_zeroth_order(
-    objective: Objective,
-    params: PyTree,
-    key: PRNGKeyArray,
-    *,
-    num_samples: int,
-    baseline: str = "leave_one_out",
-    antithetic: bool = False,
-    chunk_size: int | None = None,
+    objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> tuple[GradientEstimate, GradientEstimate]:
     """Estimate the gradient in first and in zeroth order from the same differentiated rollouts.
 
-    Arguments, errors and estimates are those of both functions. The two are dependent, and each reports the rollouts spent
-    on both: do not add them. A sample with a finite cost but no finite derivative counts in the second only.
+    Arguments, errors and estimates are those of `first_order`, and of `zeroth_order` with its default baseline. The two are
+    dependent, and each reports the rollouts spent on both: do not add them. A sample with a finite cost but no finite
+    derivative counts in the second only.
     """
     objective, vector, restore = as_vector(objective, params)
-    plan = plan_for_baseline(objective, num_samples, chunk_size, antithetic, baseline, with_gradient=True)
-    return both_results(stream(objective, vector, key, plan, both_summary), plan, baseline, restore)
+    plan = Plan(num_samples, chunk_size, with_gradient=True, with_score=True)
+    return both_results(stream(objective, vector, key, plan, both_summary), plan, restore)
 
 
 def first_order_summary(samples: Samples) -> tuple[Moments, Moments, Array]:
     """Return the moments of gradients and of costs, and the number of units that felt their noise."""
-    mask = samples.first_order_mask()
     rollouts = samples.rollouts
+    mask = samples.is_noisy & all_finite(rollouts.cost) & all_finite(rollouts.gradient_by_noise)
     gradients = Moments.of(rollouts.gradient_by_noise.mean(axis=1), mask)
     return gradients, Moments.of(rollouts.cost.mean(axis=1), mask), samples.num_felt()
 
@@ -142,7 +145,7 @@ def zeroth_order_result(summary: tuple[Any, ...], plan: Plan, baseline: str, res
     else:
         # Costs from their own starts are already taken off.
         centre = noise_free_cost if plan.with_zero_noise else jnp.zeros_like(noise_free_cost)
-        first, second = moments.about(centre)
+        first, second = moments.moved(moments.costs.above(centre))
         value, squared_error = _mean_and_squared_error(first[0], second[0, 0], moments.costs.count)
     return assemble(
         value,
@@ -161,11 +164,10 @@ def both_summary(samples: Samples) -> tuple:
     return first_order_summary(samples), zeroth_order_summary(samples)
 
 
-def both_results(
-    summary: tuple, plan: Plan, baseline: str, restore: Callable
-) -> tuple[GradientEstimate, GradientEstimate]:
-    """Return both estimates from the summary of `both_summary`."""
-    return first_order_result(summary[0], plan, restore), zeroth_order_result(summary[1], plan, baseline, restore)
+def both_results(summary: tuple, plan: Plan, restore: Callable) -> tuple[GradientEstimate, GradientEstimate]:
+    """Return both estimates from the summary of `both_summary`, the second with the leave-one-out baseline."""
+    first, zeroth = summary
+    return first_order_result(first, plan, restore), zeroth_order_result(zeroth, plan, "leave_one_out", restore)
 
 
 def _leave_one_out(moments: ScoreMoments) -> tuple[Vector, Vector]:

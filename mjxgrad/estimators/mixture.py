@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad.estimators.consistency import SecantSums, secant_sums
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Weights, norm
+from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Weights
 from mjxgrad.estimators.samples import Group, Plan, Samples, plan_by_noise, stream
-from mjxgrad.estimators.unbiased import UnbiasedTerms, gram, unbiased_terms
+from mjxgrad.estimators.unbiased import SecantSums, UnbiasedTerms, gram, secant_sums, unbiased_terms
 from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Scalar, Vector
 
@@ -121,7 +120,7 @@ class Parts(eqx.Module):
             relative_bias_bound=jnp.where(missed == 0, 0, bound),
             cost_variance=self.costs.variance(),
             scaled_first_variance=self.scaled.variance().sum(),
-            scaled_first_norm=norm(self.scaled.mean),
+            scaled_first_norm=jnp.linalg.norm(self.scaled.mean),
         )
 
     def mixture(self, alpha: Float[Array, "..."]) -> tuple[Vector, Vector]:

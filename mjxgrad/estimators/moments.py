@@ -101,17 +101,14 @@ class ScoreMoments(eqx.Module):
         second = (features[:, None] * features[None, :]).sum(axis=2)
         return cls(summary, features.sum(axis=1), second)
 
-    def about(self, centre: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
-        """Return the sums of the features, and of their products, about another centre than the mean."""
-        return self._moved(self.costs.above(centre))
-
     def merge(self, other: "ScoreMoments") -> "ScoreMoments":
         costs = self.costs.merge(other.costs)
-        mine = self._moved(self.costs.above(costs.origin) - costs.offset)
-        theirs = other._moved(other.costs.above(costs.origin) - costs.offset)
+        mine = self.moved(self.costs.above(costs.origin) - costs.offset)
+        theirs = other.moved(other.costs.above(costs.origin) - costs.offset)
         return ScoreMoments(costs, mine[0] + theirs[0], mine[1] + theirs[1])
 
-    def _moved(self, shift: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
+    def moved(self, shift: Float[Array, ""]) -> tuple[Float[Array, "3 dim"], Float[Array, "3 3 dim"]]:
+        """Return the sums of the features, and of their products, about a centre that lies below the mean by the shift."""
         return _shifted(self.first, shift, 0), _shifted(_shifted(self.second, shift, 0), shift, 1)
 
 

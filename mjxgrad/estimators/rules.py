@@ -25,13 +25,12 @@ class Evidence(eqx.Module):
         count: number of samples behind the means, or of pairs where starts are random.
         dim: number of coordinates in the block.
         first_norm: norm of the mean derivative.
-        zeroth_norm: norm of the mean of the unbiased terms.
         difference_norm: norm of the difference between the two means.
         first_variance: trace of the covariance of one sample's derivative.
         zeroth_variance: trace of the covariance of one sample's unbiased term.
         difference_variance: trace of the covariance of one sample's difference; both parts share their rollouts.
         inconsistency: share of the squared secants of the cost that derivatives do not explain, from zero.
-        relative_bias_bound: bound on the bias of the first order relative to its norm (see `consistency`): the standard
+        relative_bias_bound: bound on the bias of the first order relative to its norm (see `SecantSums`): the standard
             deviation of the cost that derivatives miss, over that of the cost that their mean explains.
         cost_variance: variance of the cost.
         scaled_first_variance: trace of the covariance of derivatives by the noise in its standard deviations.
@@ -41,7 +40,6 @@ class Evidence(eqx.Module):
     count: Int[Array, "*blocks"]
     dim: Float[Array, "*blocks"]
     first_norm: Float[Array, "*blocks"]
-    zeroth_norm: Float[Array, "*blocks"]
     difference_norm: Float[Array, "*blocks"]
     first_variance: Float[Array, "*blocks"]
     zeroth_variance: Float[Array, "*blocks"]
@@ -56,8 +54,8 @@ class Evidence(eqx.Module):
     def of(cls, first: Moments, zeroth: Moments, difference: Moments, **facts: Float[Array, ""]) -> "Evidence":
         """Return the evidence of one block: moments of both parts and of their difference, and facts, NaN if not given."""
         parts = {"first": first, "zeroth": zeroth, "difference": difference}
-        known = {f"{name}_norm": norm(part.mean) for name, part in parts.items()}
-        known |= {f"{name}_variance": part.variance().sum() for name, part in parts.items()}
+        known = {f"{name}_variance": part.variance().sum() for name, part in parts.items()}
+        known |= {f"{name}_norm": jnp.linalg.norm(parts[name].mean) for name in ("first", "difference")}
         unknown = dict.fromkeys(cls.__annotations__, jnp.full_like(known["first_norm"], jnp.nan))
         dim = jnp.ones_like(first.offset).sum()
         return cls(**{**unknown, **known, **facts, "count": first.count, "dim": dim})
@@ -66,9 +64,9 @@ class Evidence(eqx.Module):
     def real_count(self) -> Float[Array, "*blocks"]:
         return self.count.astype(self.first_norm.dtype)
 
-    def least_variance(self) -> Float[Array, "*blocks"]:
-        """Return the inverse-variance weight of the first order, V⁰/(V⁰ + V¹); 1 where both are zero."""
-        total = self.first_variance + self.zeroth_variance
+    def least_variance(self, excess: Float[Array, "*blocks"] | float = 0.0) -> Float[Array, "*blocks"]:
+        """Return the weight V⁰/(V⁰ + V¹ + excess) of the first order; 1 where all are zero."""
+        total = self.zeroth_variance + (self.first_variance + excess)
         return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
 
 
@@ -121,24 +119,20 @@ class BiasConstrained(eqx.Module):
 
     Attributes:
         gamma: the allowed norm of the bias.
-        bound: $L$, a bound on the norm of one zeroth-order term, for Bernstein's inequality as in the paper. None takes
-            an empirical bound instead: Student's quantile times the standard error of the whole vector. For a nearly
-            normal mean it is safe for every covariance: among Gaussian quadratic forms of equal mean, that of a single
-            coordinate has the heaviest tail.
-        failure_probability: $\delta$, at most 0.2 for the empirical bound.
+        bound: $L$, a bound on the norm of one zeroth-order term, for Bernstein's inequality.
+        failure_probability: $\delta$, below 1.
 
     References:
         Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, section 4. Székely, Bakirov. Extremal probabilities for Gaussian quadratic forms. Probability
-        Theory and Related Fields 126, 2003 (the empirical bound).
+        arXiv:2202.00817, section 4.
     """
 
     gamma: ArrayLike
-    bound: ArrayLike | None = None
+    bound: ArrayLike
     failure_probability: float = eqx.field(static=True, default=0.05)
 
     def __check_init__(self):
-        _check_failure_probability(self.failure_probability, 1.0 if self.bound is not None else _MOST_FAILURES)
+        _check_failure_probability(self.failure_probability, 1.0)
 
     def __call__(self, evidence: Evidence) -> Weights:
         error = self.zeroth_error(evidence)
@@ -153,8 +147,6 @@ class BiasConstrained(eqx.Module):
 
     def zeroth_error(self, evidence: Evidence) -> Float[Array, ""]:
         """Return ε; the error of the unbiased part exceeds it with probability δ at most."""
-        if self.bound is None:
-            return confidence_radius(evidence.zeroth_variance, evidence.count, self.failure_probability)
         rate = jnp.log((evidence.dim + 1) / self.failure_probability) / evidence.real_count
         return jnp.sqrt(2 * evidence.zeroth_variance * rate) + 2 / 3 * jnp.asarray(self.bound) * rate
 
@@ -187,7 +179,7 @@ class Consistent(eqx.Module):
 
     The rule asks two questions, the sharper one first:
 
-    - Do the derivatives of the samples explain the differences of their costs (see `consistency`)? If a share of more
+    - Do the derivatives of the samples explain the differences of their costs (see `SecantSums`)? If a share of more
       than `threshold` remains unexplained, $\alpha = 0$. This finds jumps with few samples and in many dimensions.
     - Does the difference of both parts exceed its own noise, $\|g^1 - g^0\| > \varepsilon$ with failure probability
       $\delta$? The excess $\|g^1 - g^0\|^2 - \varepsilon^2$ is added to the variance of the first order:
@@ -212,19 +204,11 @@ class Consistent(eqx.Module):
     def __call__(self, evidence: Evidence) -> Weights:
         error = confidence_radius(evidence.difference_variance, evidence.count, self.failure_probability)
         excess = jnp.maximum(evidence.difference_norm**2 - error**2, 0)
-        rest = evidence.first_variance + evidence.real_count * excess
-        total = evidence.zeroth_variance + rest
-        best = jnp.where(total > 0, evidence.zeroth_variance / jnp.where(total > 0, total, 1), 1)
         is_consistent = evidence.inconsistency <= self.threshold
-        alpha = jnp.where(is_consistent, best, 0)
+        alpha = jnp.where(is_consistent, evidence.least_variance(evidence.real_count * excess), 0)
         reason = Reason.where(excess > 0, Reason.bias_limit, Reason.inverse_variance)
         reason = Reason.where(is_consistent, reason, Reason.inconsistent)
         return Weights(alpha, reason, alpha * evidence.relative_bias_bound * evidence.first_norm)
-
-
-def norm(vector: Float[Array, "*n"]) -> Float[Array, ""]:
-    """Return the Euclidean norm of a vector, the magnitude of a number."""
-    return jnp.sqrt((vector**2).sum())
 
 
 # Above this, a single coordinate is not the worst case among Gaussian quadratic forms.
@@ -235,9 +219,14 @@ _LONGEST_TABLE = 1000
 def confidence_radius(
     variance: Float[Array, ""], count: Int[Array, ""], failure_probability: float
 ) -> Float[Array, ""]:
-    """Return a radius that the norm of a mean's error exceeds with the given probability; see `BiasConstrained.bound`.
+    """Return a radius that the norm of a mean's error exceeds with at most the given probability.
 
-    The variance is the trace of the covariance of one sample. Fewer than two samples give infinity.
+    It is Student's quantile times the standard error of the whole vector. For a nearly normal mean it is safe for every
+    covariance: among Gaussian quadratic forms of equal mean, that of a single coordinate has the heaviest tail. The variance
+    is the trace of the covariance of one sample. Fewer than two samples give infinity.
+
+    References:
+        Székely, Bakirov. Extremal probabilities for Gaussian quadratic forms. Probability Theory and Related Fields 126, 2003.
     """
     # JAX has no quantile of Student's t, so it comes from a table; beyond the table it is constant to three digits.
     freedom = np.arange(1, _LONGEST_TABLE)

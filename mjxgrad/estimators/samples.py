@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
@@ -88,23 +89,6 @@ class Plan:
         return num_chunks, -(-units // num_chunks)
 
 
-def plan_for_baseline(
-    objective: Objective, num_samples: int, chunk_size: int | None, antithetic: bool, baseline: str, **wanted: bool
-) -> Plan:
-    """Return a plan with the rollouts without noise that a baseline needs."""
-    check_baseline(baseline)
-    is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
-    return Plan(
-        num_samples,
-        chunk_size,
-        antithetic,
-        with_score=True,
-        with_zero_noise=is_needed and not has_own,
-        zero_noise_per_unit=is_needed and has_own,
-        **wanted,
-    )
-
-
 def check_baseline(baseline: str, choices: tuple[str, ...] = ("leave_one_out", "zero_noise", "none")) -> None:
     """Raise a ValueError for an unknown baseline."""
     if baseline not in choices:
@@ -140,13 +124,9 @@ class Samples(eqx.Module):
     zero_noise_costs: Float[Array, " units"]
     has_no_effect: Bool[Array, " units"]
 
-    def first_order_mask(self) -> Bool[Array, " units"]:
-        """Return which units a first-order estimate can use."""
-        return self.is_noisy & _all_finite(self.rollouts.cost) & _all_finite(self.rollouts.gradient_by_noise)
-
     def zeroth_order_mask(self) -> Bool[Array, " units"]:
         """Return which units a zeroth-order estimate can use, whatever their gradients."""
-        is_finite = _all_finite(self.rollouts.cost) & _all_finite(self.rollouts.noise_score)
+        is_finite = all_finite(self.rollouts.cost) & all_finite(self.rollouts.noise_score)
         return self.is_noisy & is_finite & jnp.isfinite(self.zero_noise_costs)
 
     def noise_free_cost(self) -> Scalar:
@@ -185,7 +165,7 @@ def sample(objective: Objective, params: Vector, key: PRNGKeyArray, plan: Plan, 
     evaluate = objective.differentiate if plan.by_noise else functools.partial(_by_parameters, objective, plan)
     flat = jax.vmap(functools.partial(evaluate, params))(jax.tree.map(in_order, *images))
     found = jax.tree.map(lambda leaf: leaf.reshape(len(units), len(images), *leaf.shape[1:]), flat)
-    is_same = (found.cost == found.cost[:, :1]).all(axis=1) & _all_finite(found.cost)
+    is_same = (found.cost == found.cost[:, :1]).all(axis=1) & all_finite(found.cost)
     is_flat = (found.gradient_by_noise == 0).all(axis=(1, 2))
     zero_noise_costs = jnp.zeros_like(found.cost[:, 0])
     if plan.zero_noise_per_unit:
@@ -267,14 +247,6 @@ class Group(eqx.Module):
     def noise(self) -> Float[Array, "samples m"]:
         return self.scores * self.stddev**2
 
-    def same_start(self) -> Bool[Array, "samples samples"]:
-        """Return which pairs of samples differ only in their noise."""
-        count = len(self.costs)
-        if self.per_unit == 1:
-            return jnp.ones((count, count), bool)
-        unit = jnp.arange(count) // self.per_unit
-        return unit[:, None] == unit[None, :]
-
     def by_unit(self, values: Float[Array, "samples *shape"]) -> Float[Array, "units *shape"]:
         """Return the mean over each unit."""
         return values.reshape(-1, self.per_unit, *values.shape[1:]).mean(axis=1)
@@ -300,10 +272,8 @@ class Group(eqx.Module):
             return filled.reshape(num_groups, size, *leaf.shape[1:])
 
         own = ("costs", "derivatives", "scores", "has_cost", "has_derivative")
-        shared = ("stddev", "centre", "rounding")
-        parts = {name: split(getattr(self, name)) for name in own}
-        parts |= {n: jnp.broadcast_to(getattr(self, n), (num_groups, *getattr(self, n).shape)) for n in shared}
-        return Group(**parts, per_unit=unit)
+        each = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_groups, *leaf.shape)), self)
+        return dataclasses.replace(each, **{name: split(getattr(self, name)) for name in own})
 
 
 def _by_parameters(objective: Objective, plan: Plan, params: Vector, noise: PyTree) -> Differentiated:
@@ -322,10 +292,10 @@ def _by_parameters(objective: Objective, plan: Plan, params: Vector, noise: PyTr
 
 def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
     """Return whether two draws of noise differ in any floating-point number."""
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    differences = [(x != y).any() for x, y in pairs if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.stack([jnp.zeros((), bool), *differences]).any()
+    mine, theirs = (ravel_pytree(eqx.filter(noise, eqx.is_inexact_array))[0] for noise in (one, other))
+    return (mine != theirs).any()
 
 
-def _all_finite(array: Float[Array, "units ..."]) -> Bool[Array, " units"]:
+def all_finite(array: Float[Array, "units ..."]) -> Bool[Array, " units"]:
+    """Return which units have only finite numbers."""
     return jnp.isfinite(array).all(axis=tuple(range(1, array.ndim)))

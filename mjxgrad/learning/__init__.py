@@ -4,6 +4,6 @@ from mjxgrad.learning.evaluate import Evaluation, evaluate
 from mjxgrad.learning.learn import Learned, learn
 from mjxgrad.learning.learner import Learner, Policy
 from mjxgrad.learning.settings import Settings
-from mjxgrad.loop import Log
+from mjxgrad.loop.run import Log
 
 __all__ = ["Evaluation", "Learned", "Learner", "Log", "Policy", "Settings", "evaluate", "learn"]

@@ -1,7 +1,6 @@
 """Checkpoints: a run on disk, complete or not at all."""
 
 import hashlib
-import io
 import json
 import os
 import tempfile
@@ -14,20 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-FORMAT = 2
+FORMAT = 3
+_PARTS = {
+    "program": "the code of environment, objective, estimator, optimiser, method or versions of the libraries",
+    "arrays": "arrays in environment, objective or method",
+    "start": "params or key",
+}
 
 
 def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
     """Write a pytree of arrays atomically: an interruption leaves the former file intact."""
-    buffer = io.BytesIO()
     leaves = {f"leaf{i}": _as_numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
     header = json.dumps({"format": FORMAT, **fingerprint}).encode()
-    np.savez(buffer, allow_pickle=False, header=np.frombuffer(header, np.uint8), **leaves)
     # In the same folder: a rename is atomic within one file system only.
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(buffer.getvalue())
+            np.savez(file, allow_pickle=False, header=np.frombuffer(header, np.uint8), **leaves)
             file.flush()
             os.fsync(file.fileno())
         Path(temporary).replace(path)
@@ -54,11 +56,11 @@ def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
             "delete it to begin anew"
         ) from error
     expected = {"format": FORMAT, **fingerprint}
-    differing = [name for name in expected if header.get(name) != expected[name]]
+    differing = {name: value for name, value in expected.items() if header.get(name) != value}
     if differing:
-        changes = ", ".join(_difference(name, header.get(name), expected[name]) for name in differing)
+        changes = [_PARTS.get(name, f"{name} was {header.get(name)} and is {here}") for name, here in differing.items()]
         raise ValueError(
-            f"checkpoint must be of the same run, got {path} of one with other settings: {changes}; "
+            f"checkpoint must be of the same run, got {path} of one with other settings: {', '.join(changes)}; "
             "use the settings of that run, or another path"
         )
     wanted = jax.tree.leaves(like)
@@ -73,15 +75,6 @@ def digest(tree: PyTree) -> str:
         sha.update(f"{array.dtype}{array.shape}".encode())
         sha.update(np.ascontiguousarray(array).tobytes())
     return sha.hexdigest()[:16]
-
-
-def _difference(name: str, there: Any, here: Any) -> str:
-    explanations = {
-        "program": "the code of environment, objective, estimator, optimiser, method or versions of the libraries",
-        "arrays": "arrays in environment, objective or method",
-        "start": "params or key",
-    }
-    return explanations.get(name, f"{name} was {there} and is {here}")
 
 
 def _as_numpy(leaf: Any) -> np.ndarray:

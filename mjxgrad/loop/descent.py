@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import whole
-from mjxgrad._programs import compile_once
+from mjxgrad._programs import compile_once, is_traced
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
 from mjxgrad.loop.run import Log, Method, Progress, mean
-from mjxgrad.objective.base import Scalar, Vector
+from mjxgrad.objective.base import Scalar, Vector, check_vector
 
 # Progress is shown every five per cent; each time costs one return from the device.
 NUM_SEGMENTS = 20
@@ -89,7 +89,7 @@ class Descent(Method):
 
     def begun(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> dict[str, Any]:
         """Return the arguments of `run` besides the method; with a leading axis of keys, one start per key."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, params, key))):
+        if is_traced((self, params, key)):
             raise ValueError(
                 "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles its own program, "
                 "and takes one key per seed"
@@ -100,18 +100,12 @@ class Descent(Method):
                 f"key must come from jax.random.key, with at most one leading axis, got {key.dtype} of shape {key.shape}; "
                 "jax.random.split(jax.random.key(0), num_seeds) gives one per seed"
             )
-        if not jnp.issubdtype(params.dtype, jnp.floating):
-            raise ValueError(f"params must be floating-point, got {params.dtype}; write 1.0 in place of 1")
         if params.ndim == 2 and key.shape != params.shape[:1]:
             raise ValueError(
                 f"params must have a leading axis only where key has the same, got shapes {params.shape} and {key.shape}; "
                 "jax.random.split(key, len(params)) gives a key for each"
             )
-        if params.ndim not in (1, 2):
-            raise ValueError(
-                f"params must be a vector of shape (dim,), or one per seed, got shape {params.shape}; "
-                "use jnp.atleast_1d for one number, objective.ravel for controls"
-            )
+        check_vector(params.shape[params.ndim == 2 :], params.dtype)
         return {
             "start": (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key),
             "over": [None] * key.ndim,

@@ -112,13 +112,8 @@ class GradientStep(Descent):
                 f"optimiser must be of optax, with its settings, such as optax.adam(1e-2), got {self.optimiser!r}"
             )
 
-    @property
-    def transformation(self) -> optax.GradientTransformationExtraArgs:
-        """The optimiser; it accepts the cost as `value`, as `reduce_on_plateau` needs it."""
-        return optax.with_extra_args_support(self.optimiser)
-
     def init_state(self, params: Vector) -> PyTree:
-        return jax.tree.map(jnp.asarray, self.transformation.init(params))
+        return jax.tree.map(jnp.asarray, self.optimiser.init(params))
 
     def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
         scale, objective = self.annealed(self.objective, carry.params, index)
@@ -134,7 +129,7 @@ class GradientStep(Descent):
         if self.annealing is None:
             return jnp.ones((), params.dtype), as_objective(objective)
         scale = jnp.asarray(self.annealing(step), params.dtype)
-        return scale, objective if isinstance(objective, Objective) else objective(scale)
+        return scale, objective(scale)  # pyright: ignore[reportCallIssue]
 
     def change(
         self, params: Vector, state: PyTree, estimate: GradientEstimate, gradient: Vector
@@ -146,7 +141,9 @@ class GradientStep(Descent):
         is_finite = jnp.isfinite(gradient).all()
         # NaN must not reach the optimiser: its behaviour is then undefined, even if the result is discarded.
         gradient = jnp.where(is_finite, gradient, 0).astype(params.dtype)
-        updates, moved = self.transformation.update(gradient, state, params, value=estimate.objective_mean)
+        # `reduce_on_plateau` needs the cost.
+        update = optax.with_extra_args_support(self.optimiser).update
+        updates, moved = update(gradient, state, params, value=estimate.objective_mean)
         change = jnp.asarray(updates)
         is_taken = is_finite & jnp.isfinite(params + change).all()
         moved = jax.tree.map(lambda new, old: jnp.where(is_taken, new, old), moved, state)

@@ -37,10 +37,8 @@ class Record(eqx.Module):
         cost: mean cost under noise at the parameters before the step.
         cost_error: standard error of `cost`.
         gradient_norm: norm of the estimate.
-        gradient_error: norm of the standard error of the estimate.
         alpha: weight of the first-order part.
         reason: reason for `alpha`.
-        bias_bound: bound on the norm of the bias; NaN where nothing is known.
         scale: scale of the annealing; 1 without annealing.
         step_norm: norm of the change of the parameters.
         finite_fraction: share of the samples that were finite.
@@ -52,10 +50,8 @@ class Record(eqx.Module):
     cost: Numbers
     cost_error: Numbers
     gradient_norm: Numbers
-    gradient_error: Numbers
     alpha: Numbers
     reason: Reason
-    bias_bound: Numbers
     scale: Numbers
     step_norm: Numbers
     finite_fraction: Numbers
@@ -69,7 +65,7 @@ class Record(eqx.Module):
         nan, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), jnp.int32)
         # As an array, like the reasons of steps.
         reason = jax.tree.map(jnp.asarray, Reason.fixed)
-        return cls(nan, nan, nan, nan, nan, reason, nan, nan, nan, nan, none, none, jnp.zeros((), bool))
+        return cls(nan, nan, nan, nan, reason, nan, nan, nan, none, none, jnp.zeros((), bool))
 
     @classmethod
     def of_estimate(
@@ -81,10 +77,8 @@ class Record(eqx.Module):
             cost=estimate.objective_mean.astype(dtype),
             cost_error=estimate.objective_standard_error.astype(dtype),
             gradient_norm=jnp.linalg.norm(estimate.value),
-            gradient_error=jnp.linalg.norm(estimate.standard_error),
             alpha=estimate.alpha.astype(dtype),
             reason=estimate.reason,
-            bias_bound=estimate.bias_bound.astype(dtype),
             scale=jnp.asarray(scale, dtype),
             step_norm=jnp.asarray(step_norm, dtype),
             finite_fraction=jnp.asarray(estimate.finite_fraction, dtype),
@@ -113,13 +107,9 @@ class Best(eqx.Module):
         Less smoothing wins first, because costs under different noise are not comparable. Then the larger share of finite
         rollouts wins, so that divergence does not pay; then the lower cost.
         """
-        is_better = (other.scale < self.scale) | (
-            (other.scale == self.scale)
-            & (
-                (other.finite_fraction > self.finite_fraction)
-                | ((other.finite_fraction == self.finite_fraction) & (other.cost < self.cost))
-            )
-        )
+        mine, theirs = self.finite_fraction, other.finite_fraction
+        is_better = jnp.where(theirs == mine, other.cost < self.cost, theirs > mine)
+        is_better = jnp.where(other.scale == self.scale, is_better, other.scale < self.scale)
         is_better = jnp.isfinite(other.cost) & (is_better | jnp.isnan(self.cost))
         return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
 

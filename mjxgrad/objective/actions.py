@@ -1,4 +1,4 @@
-"""The cost of a task with noise on its controls, in open loop and in closed loop."""
+"""The cost of a task with noise on its controls, in open loop and in closed loop; and the linear policy."""
 
 import dataclasses
 from abc import abstractmethod
@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import whole
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -25,6 +26,7 @@ from mjxgrad.objective.base import (
 )
 from mjxgrad.objective.parameters import flattened
 from mjxgrad.objective.task import Outcome, Policy, Task, as_pytree
+from mjxgrad.rollouts import State
 
 
 class ActionNoise(Objective):
@@ -79,13 +81,7 @@ class ActionNoise(Objective):
         actions, drawn = jnp.zeros(self.noise_shape, self.stddev.dtype), self._start_shape()
         if drawn is None:
             return actions
-        nominal = self.task.nominal_start()
-        if jax.tree.structure(nominal) != jax.tree.structure(drawn):
-            raise ValueError(
-                f"nominal_start must have the structure of sample_start, {jax.tree.structure(drawn)}, "
-                f"got {jax.tree.structure(nominal)}"
-            )
-        return actions, jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), nominal, drawn)
+        return actions, jax.tree.map(lambda like, leaf: jnp.asarray(leaf, like.dtype), drawn, self.task.nominal_start())
 
     def split(self, noise: PyTree) -> tuple[Float[Array, "horizon nu"], PyTree]:
         """Return the action noise and the start, None where the start is not random."""
@@ -275,3 +271,58 @@ def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Arr
     if not fits:
         raise ValueError(f"stddev must broadcast to (horizon, nu) = {shape}, got {stddev.shape}")
     return stddev
+
+
+class LinearPolicy(eqx.Module):
+    """The policy of `linear_policy`: its parameters are a map of what it observes."""
+
+    observe: Callable[[Any], Float[Array, " observed"]] = eqx.field(converter=as_pytree)
+
+    def __call__(self, params: eqx.nn.Linear, state: Any) -> Float[Array, " nu"]:
+        seen, size = self.observe(state), params.weight.shape[1]
+        if seen.shape != (size,):
+            raise ValueError(
+                f"the policy must observe {size} numbers, got shape {seen.shape}; set num_states, or observe"
+            )
+        return params(seen)
+
+
+def whole_state(state: Any) -> Float[Array, " observed"]:
+    """Return a vector unchanged, or the positions, velocities and activations of a scene's state, in this order."""
+    if isinstance(state, State):
+        return jnp.concatenate([state.qpos, state.qvel, state.act])
+    if not isinstance(state, jax.Array) or state.ndim != 1:
+        raise ValueError(f"state must be a vector or a State, got {type(state).__name__}; pass observe=")
+    return state
+
+
+def linear_policy(
+    num_states: int,
+    num_controls: int,
+    *,
+    bias: bool = True,
+    observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
+) -> tuple[LinearPolicy, eqx.nn.Linear]:
+    """Return the policy u = K x + k, with parameters that are zero: K is their `weight`, k their `bias`.
+
+        policy, params = linear_policy(4, 1)
+        objective = closed_loop(task, policy, stddev=0.1, params=params)
+
+    Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero.
+
+    Args:
+        num_states: number of observed values.
+        num_controls: number of controls.
+        bias: whether there is the constant k.
+        observe: function from the task's state or observations to a vector. Positions of a free body contain a
+            quaternion, and angles do not wrap, so choose what you need.
+
+    Returns:
+        The policy, called as `policy(params, state)`, and its parameters.
+
+    Raises:
+        ValueError: if a number is below 1.
+    """
+    sizes = whole("num_states", num_states), whole("num_controls", num_controls)
+    drawn = eqx.nn.Linear(*sizes, use_bias=bias, key=jax.random.key(0))
+    return LinearPolicy(observe), jax.tree.map(jnp.zeros_like, drawn)

@@ -131,20 +131,25 @@ class Objective(eqx.Module):
             ValueError: if `params` is not a vector of floating-point numbers, or not of length `dim`.
         """
         shape = jnp.shape(params)
-        if len(shape) != 1:
-            raise ValueError(
-                f"params must be a vector of shape (dim,), got shape {shape}; "
-                "use jnp.atleast_1d for one number, objective.ravel for controls"
-            )
-        if not jnp.issubdtype(jnp.result_type(params), jnp.floating):
-            raise ValueError(f"params must be floating-point, got {jnp.result_type(params)}; write 1.0 in place of 1")
-        if not shape[0]:
-            raise ValueError("params must have at least one number, got none")
+        check_vector(shape, jnp.result_type(params))
         if self.dim is None:
             return dataclasses.replace(self, dim=shape[0])
         if shape[0] != self.dim:
             raise ValueError(f"params must have shape ({self.dim},), got {shape}")
         return self
+
+
+def check_vector(shape: tuple[int, ...], dtype: jnp.dtype) -> None:
+    """Refuse all but vectors of floating-point numbers as parameters."""
+    if len(shape) != 1:
+        raise ValueError(
+            f"params must be a vector of shape (dim,), got shape {shape}; "
+            "use jnp.atleast_1d for one number, objective.ravel for controls"
+        )
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"params must be floating-point, got {dtype}; write 1.0 in place of 1")
+    if not shape[0]:
+        raise ValueError("params must have at least one number, got none")
 
 
 def unchanged(vector: Vector) -> Vector:

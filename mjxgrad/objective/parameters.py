@@ -50,8 +50,7 @@ class ParameterNoise(Objective):
         return Differentiated(cost, gradient, self.score(params, noise), stddev, Partial(unchanged))
 
     def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ParameterNoise":
-        new = parameter_noise(self.function, stddev, self.dim)
-        return dataclasses.replace(self, stddev=new.stddev, dim=new.dim)
+        return parameter_noise(self.function, stddev, self.dim)
 
 
 def parameter_noise(

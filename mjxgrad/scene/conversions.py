@@ -5,7 +5,7 @@ kept exactly the conversion says so, and loading the scene warns.
 """
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -43,10 +43,6 @@ class Conversion:
     exact: bool = True
 
 
-def _has(model: mujoco.MjModel, flag: int) -> bool:
-    return bool(model.opt.disableflags & flag)
-
-
 def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
     for flag, reason, exact in (
         (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only", True),
@@ -58,7 +54,7 @@ def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
             what = f"flag {flag.name.removeprefix('mjENBL_').lower()}"
             yield Conversion(what, "enable", "disable", reason, exact)
     for flag in ("ISLAND", "MIDPHASE", "NATIVECCD", "MULTICCD", "AUTORESET"):
-        if _has(model, getattr(_DISABLE, f"mjDSBL_{flag}").value):
+        if model.opt.disableflags & getattr(_DISABLE, f"mjDSBL_{flag}").value:
             reason = "chooses between algorithms of C MuJoCo; MJX has its own"
             yield Conversion(f"flag {flag.lower()}", "disable", "ignored", reason)
 
@@ -87,7 +83,7 @@ def _wind(model: mujoco.MjModel) -> Iterator[Conversion]:
 
 
 def _no_passive_forces(model: mujoco.MjModel) -> Iterator[Conversion]:
-    if all(_has(model, flag.value) for flag in (_DISABLE.mjDSBL_SPRING, _DISABLE.mjDSBL_DAMPER)):
+    if all(model.opt.disableflags & flag.value for flag in (_DISABLE.mjDSBL_SPRING, _DISABLE.mjDSBL_DAMPER)):
         model.opt.disableflags |= _EULERDAMP
         reason = "with the damper flag disabled C MuJoCo integrates no damping, MJX would"
         yield Conversion("flag eulerdamp", "enable", "disable", reason)
@@ -172,10 +168,9 @@ def _is_unmatched_contact(model: mujoco.MjModel, sensor: int) -> bool:
     return bool(objects & by_body) or by_site or net_force
 
 
-_Rules = tuple[Callable[[mujoco.MjModel], Iterator[Conversion]], ...]
 # The first group avoids refusals and runs before them, the second runs after them.
-BEFORE_REFUSALS: _Rules = (_flags, _wind)
-AFTER_REFUSALS: _Rules = (_solver, _no_passive_forces, _least_friction, _implicitfast)
+BEFORE_REFUSALS = (_flags, _wind)
+AFTER_REFUSALS = (_solver, _no_passive_forces, _least_friction, _implicitfast)
 
 # The stage; why it is left out without elements; whether there are any; the flag that disables it.
 _STAGES = (

@@ -187,7 +187,14 @@ def _converted(
                 f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
                 "pip install 'mjxgrad[mjx]' for MJX's step"
             )
-        conversions = _make_simulable(model, name)
+        conversions = [c for rule in BEFORE_REFUSALS for c in rule(model)]
+        refused = refusal_messages(model)
+        if len(refused) == 1:
+            raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
+        if refused:
+            listed = "\n".join(f"  - {message}" for message in refused)
+            raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
+        conversions += [c for rule in AFTER_REFUSALS for c in rule(model)]
         stepped = copy.deepcopy(model)
         conversions += list(drop_sensors(stepped))
     except SceneError as error:
@@ -195,18 +202,6 @@ def _converted(
             raise
         return original, kinematics_alone(original), [], str(error)
     return model, stepped, conversions, ""
-
-
-def _make_simulable(mj_model: mujoco.MjModel, name: str) -> list[Conversion]:
-    """Convert in place what can be converted; refuse the rest."""
-    conversions = [c for rule in BEFORE_REFUSALS for c in rule(mj_model)]
-    refused = refusal_messages(mj_model)
-    if len(refused) == 1:
-        raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
-    if refused:
-        listed = "\n".join(f"  - {message}" for message in refused)
-        raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
-    return [*conversions, *(c for rule in AFTER_REFUSALS for c in rule(mj_model))]
 
 
 def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:

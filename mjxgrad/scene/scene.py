@@ -184,8 +184,8 @@ class Scene(eqx.Module):
             _contacts(self),
             _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),
-            _bullets("Contacts unlike C MuJoCo", contact_differences(self.mj_model, self.pairs)),
-            _bullets("Warnings", self.warnings()),
+            _table("Contacts unlike C MuJoCo", [(text,) for text in contact_differences(self.mj_model, self.pairs)]),
+            _table("Warnings", [(text,) for text in self.warnings()]),
         ]
         return "\n\n".join(section for section in sections if section)
 
@@ -234,21 +234,15 @@ def _enclose(target: mujoco.MjModel) -> None:
 
 
 def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
-    present = getattr(target, name, None)
-    if not isinstance(present, float | np.ndarray):
-        return
-    given = np.asarray(present)
+    given = np.asarray(getattr(target, name, None))
     if not np.issubdtype(given.dtype, np.floating):
         return
     if given.size != value.size:
         raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; take one element of the batch")
     value = value.reshape(given.shape)
     # Numbers that differ only by float32 rounding keep the digits of the file.
-    changed = value != given.astype(value.dtype)
-    if isinstance(present, float):
-        setattr(target, name, float(value if changed else given))
-    else:
-        present[changed] = value[changed]
+    used = np.where(value == given.astype(value.dtype), given, value)
+    setattr(target, name, used if used.ndim else float(used))
 
 
 def _heading(scene: Scene) -> str:
@@ -338,13 +332,6 @@ def _table(title: str, rows: Sequence[tuple[str, ...]], *, is_numeric: bool = Fa
     width, align = (10**6, str.rjust) if is_numeric else (_WIDTH, str.ljust)
     wrap = textwrap.TextWrapper(width, initial_indent="  ", subsequent_indent="      ").fill
     return "\n".join([title, *map(wrap, aligned(rows, align))])
-
-
-def _bullets(title: str, sentences: Sequence[str]) -> str:
-    if not sentences:
-        return ""
-    wrapped = (textwrap.fill(sentence, _WIDTH, initial_indent="  ", subsequent_indent="    ") for sentence in sentences)
-    return "\n".join([title, *wrapped])
 
 
 def sensor(model: mjx.Model, data: mjx.Data, name: str) -> Float[Array, " dim"]:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjxgrad.objective.policy import linear_policy
+from mjxgrad.objective import linear_policy
 from mjxgrad.rollouts import State, Trajectory, initial_state
 from mjxgrad.tasks.action_task import ActionTask, robot_scene
 

@@ -14,8 +14,7 @@ from mjxgrad.checking import findings
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
 from mjxgrad.checking.measure import Line, Measured, crossing, estimates, measure
-from mjxgrad.checking.motions import most_contacts, random_motions
-from mjxgrad.checking.moving import KINDS, REFINED, Direction, Moved, Mover
+from mjxgrad.checking.motions import KINDS, REFINED, Direction, Moved, Mover, most_contacts, random_motions
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
@@ -282,7 +281,7 @@ def line_of(slope, discrete, growth=1.0, fine=1.0):
     plain, shorter = (compare_to_slope(places, rise * outcomes, filled, KINDS) for rise in (1.0, fine))
     none = Jumps(*[np.zeros(0)] * 3)
     line = Line("the reference pose", "the start", plain, shorter, none, (), growth * np.ones(2), 0)
-    return Measured(np.array([0.05, 0.1]), 50, (line,), ())
+    return Measured(np.array([0.05, 0.1]), (line,), ())
 
 
 def test_a_derivative_that_is_off_or_too_scattered_to_tell_is_not_the_slope():

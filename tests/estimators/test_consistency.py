@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxgrad.estimators.consistency import secant_sums
 from mjxgrad.estimators.samples import Group, plan_by_noise, sample
-from mjxgrad.estimators.unbiased import gram
+from mjxgrad.estimators.unbiased import gram, secant_sums
 from mjxgrad.objective import parameter_noise
 
 STDDEVS = jnp.array([0.1, 0.2])

@@ -15,7 +15,6 @@ def evidence(**changes) -> Evidence:
         "count": 50,
         "dim": 3.0,
         "first_norm": 2.0,
-        "zeroth_norm": 2.1,
         "difference_norm": 0.3,
         "first_variance": 1.0,
         "zeroth_variance": 4.0,

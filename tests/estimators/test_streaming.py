@@ -21,18 +21,23 @@ def objective():
 
 
 @pytest.mark.parametrize("chunk_size", [2, 64])
-@pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
-def test_the_size_of_chunks_changes_nothing_but_rounding(objective, key, chunk_size, baseline):
-    settings = {"num_samples": 130, "baseline": baseline, "antithetic": True}
-    for chunked, whole in zip(
-        first_and_zeroth_order(objective, POINT, key, chunk_size=chunk_size, **settings),
-        first_and_zeroth_order(objective, POINT, key, **settings),
-        strict=True,
-    ):
-        # Sums of 130 terms of order one, added in another order.
-        for name in ("value", "standard_error", "objective_mean", "num_finite", "num_rollouts"):
-            one, other = getattr(chunked, name), getattr(whole, name)
-            np.testing.assert_allclose(one, other, rtol=1e4 * jnp.finfo(POINT.dtype).eps)
+@pytest.mark.parametrize(
+    ("estimator", "settings"),
+    [
+        (first_order, {}),
+        (zeroth_order, {"baseline": "leave_one_out", "antithetic": True}),
+        (zeroth_order, {"baseline": "zero_noise", "antithetic": True}),
+        (zeroth_order, {"baseline": "none", "antithetic": True}),
+    ],
+)
+def test_the_size_of_chunks_changes_nothing_but_rounding(objective, key, chunk_size, estimator, settings):
+    chunked, whole = (
+        estimator(objective, POINT, key, num_samples=130, chunk_size=size, **settings) for size in (chunk_size, None)
+    )
+    # Sums of 130 terms of order one, added in another order.
+    for name in ("value", "standard_error", "objective_mean", "num_finite", "num_rollouts"):
+        one, other = getattr(chunked, name), getattr(whole, name)
+        np.testing.assert_allclose(one, other, rtol=1e4 * jnp.finfo(POINT.dtype).eps)
 
 
 def test_memory_does_not_grow_with_the_number_of_samples(objective, key):
@@ -60,7 +65,7 @@ def test_sharing_rollouts_gives_what_each_estimator_gives_alone(objective, key):
         (zeroth_order, {"baseline": "zero_noise"}, 41, 0),
         (zeroth_order, {"antithetic": True}, 40, 0),
         (eqx.filter_jit(estimators.alpha_order), {}, 40, 40),
-        (lambda *a, **k: first_and_zeroth_order(*a, **k)[0], {"baseline": "zero_noise"}, 41, 41),
+        (lambda *a, **k: first_and_zeroth_order(*a, **k)[0], {}, 40, 40),
     ],
 )
 def test_rollouts_are_counted_as_they_are_spent(key, estimator, settings, rollouts, gradients):
