@@ -1,5 +1,6 @@
 """A rollout by MJX: one checkpointed scan with a small carry, and failure flags."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -117,7 +118,7 @@ class Scan(eqx.Module):
 
 def rolled_out(scan: Scan, state: State, rows: tuple[Array, Array, dict[str, Array]]) -> Trajectory:
     """Return the result of `rollout` for checked arguments; `rows` are controls, noise and inputs of each step."""
-    advance = lambda carry, given: scan.advance(carry, given)  # noqa: E731 - a method of a pytree has no hash
+    advance = functools.partial(Scan.advance, scan)  # a bound method of a pytree has no hash
     if scan.checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
         # Inside a scan prevent_cse is needless: XLA cannot merge the recomputation with the forward pass.
