@@ -1,8 +1,16 @@
 """Numbers and names as text, for messages and tables."""
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
+
+
+class Printed:
+    """Something that a notebook shows as `print` does, and not as all its arrays."""
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        printer.text(str(self))
 
 
 def name_pairs(pairs: Sequence[object]) -> str:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._text import format_number
+from mjxgrad._text import Printed, format_number
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.figure import telling
@@ -33,7 +33,7 @@ _MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Printed):
     """The result of `check`.
 
     Attributes:

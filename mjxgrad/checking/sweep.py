@@ -14,7 +14,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._arrays import is_known
-from mjxgrad._text import format_number
+from mjxgrad._text import Printed, format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range
@@ -141,7 +141,7 @@ class Knob:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class Sweep(Printed):
     """The result of `sweep`: the scene, a description, the stiffness of the file's contacts, and the measurements."""
 
     name: str

@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
 from mjxgrad._arrays import whole
 from mjxgrad._programs import compile_once
-from mjxgrad._text import aligned, format_number
+from mjxgrad._text import Printed, aligned, format_number
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
@@ -108,7 +108,7 @@ def map_in_chunks(function: Callable, points: PyTree, chunk_size: int) -> PyTree
     return jax.tree.map(lambda leaf: leaf[:count], jax.lax.map(function, filled, batch_size=size))
 
 
-class BiasVariance(eqx.Module):
+class BiasVariance(eqx.Module, Printed):
     """The measurements of `bias_variance`; the leading axes are `softness` × `points`.
 
     Attributes:

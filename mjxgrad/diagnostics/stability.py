@@ -20,7 +20,7 @@ import jax
 import mujoco
 import numpy as np
 
-from mjxgrad._text import aligned, format_number, format_range, name_pairs
+from mjxgrad._text import Printed, aligned, format_number, format_range, name_pairs
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
@@ -153,7 +153,7 @@ def restitution(damping_ratio: float) -> float:
 
 
 @dataclass(frozen=True)
-class StabilityReport:
+class StabilityReport(Printed):
     """The springs of a scene, judged at its time step.
 
     Attributes:

@@ -22,7 +22,7 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from mjxgrad._text import aligned, format_number
+from mjxgrad._text import Printed, aligned, format_number
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
@@ -45,7 +45,7 @@ class Stopped(enum.Enum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Identification:
+class Identification(Printed):
     """Parameters from recorded motions.
 
     Attributes:
@@ -125,6 +125,9 @@ class Identification:
             rms += f"; held out: {self.held_out_rms[0]:.3g} and {self.held_out_rms[1]:.3g}"
         warnings = [f"\n{line}" for line in self.warnings()]
         return "\n".join([f"{head}, {self.stopped.value}.", f"{rms}.", "", *aligned(self.rows()), *warnings])
+
+    def __str__(self) -> str:
+        return self.summary()
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return the values as a table of text, header first: name and unit, value, interval, start, bounds."""

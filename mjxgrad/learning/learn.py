@@ -26,13 +26,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
+from mjxgrad._text import Printed
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import ActorCritic, Learner, Policy
 from mjxgrad.learning.settings import Settings
 from mjxgrad.loop.run import Log, run, side_by_side
 
 
-class Learned(eqx.Module):
+class Learned(eqx.Module, Printed):
     """The result of `learn`.
 
     Attributes:
@@ -44,6 +45,15 @@ class Learned(eqx.Module):
     policy: Policy
     history: dict[str, Float[Array, "updates *policies"]]
     learner: Learner
+
+    def __str__(self) -> str:
+        reward, agreement = (np.asarray(self.history[name]) for name in ("reward", "agreement"))
+        late = slice(-max(1, len(reward) // 10), None)
+        low, high = (f"{x:.4g}" for x in (reward[late].mean(axis=0).min(), reward[late].mean(axis=0).max()))
+        rewards = low if low == high else f"{low} to {high}"
+        agreed = f"halves of the environments agree to {np.nanmean(agreement[late]):.2f}"
+        seconds = np.asarray(self.history["seconds"]).reshape(len(reward), -1)[:, 0].sum()
+        return f"Reward {rewards} a step in the last of {len(reward)} updates, {seconds:.3g} s; {agreed}."
 
 
 def learn(

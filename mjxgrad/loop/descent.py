@@ -103,9 +103,11 @@ class Descent(Method):
         if params.ndim == 2 and key.shape != params.shape[:1]:
             raise ValueError(
                 f"params must have a leading axis only where key has the same, got shapes {params.shape} and {key.shape}; "
-                "jax.random.split(key, len(params)) gives a key for each"
+                "jax.random.split(key, len(params)) gives a key for each, and a matrix of controls is {'controls': matrix} here"
             )
         check_vector(params.shape[params.ndim == 2 :], params.dtype)
+        if not jnp.isfinite(params).all():
+            raise ValueError(f"params must be finite at the start, got {params}")
         return {
             "start": (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key),
             "over": [None] * key.ndim,
@@ -139,7 +141,8 @@ class Descent(Method):
         stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, Stopped.running)
         enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
         stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, stopped)
-        stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
+        most = min(options.patience, options.num_steps)
+        stopped = Stopped.where(num_in_a_row >= most, Stopped.not_finite, stopped)
         best = carry.best.against(candidate)
         after = Carry(params, state, carry.key, best, num_in_a_row, num_still, stopped)
         # One of several runs may have stopped before the others.

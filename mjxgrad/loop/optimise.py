@@ -55,8 +55,8 @@ def optimise(
     Args:
         objective: the objective to minimise, or with `annealing` a function from a scale to an objective.
         params: the start: a vector, with many seeds also one per seed; or a pytree with floating-point arrays, such as a
-            dict or an equinox module. The function of `parameter_noise` and `evaluate` then take a pytree of the same
-            form, and the result has this form. Estimators see all its arrays as one vector.
+            dict, an equinox module or a matrix of controls. The function of `parameter_noise` and `evaluate` then take a
+            pytree of the same form, and the result has this form. Estimators see all its arrays as one vector.
         key: key of all noise; with a leading axis, one per seed.
         estimator: function called as `estimator(objective, params, key)`: your own, or one of `mg.estimators` with its
             settings bound by `functools.partial`.
@@ -72,7 +72,7 @@ def optimise(
         ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
             or a checkpoint is damaged or from another run.
     """
-    vector, restore = flattened(params)
+    vector, restore = flattened(params, 1 + jnp.ndim(key))
     chosen = RunOptions(num_steps, **options)
     if restore is not None and chosen.evaluate is not None:
         chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))

@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from mjxgrad._text import Printed, format_range
 from mjxgrad.estimators import GradientEstimate, Reason
 from mjxgrad.loop.run import Progress
 
@@ -139,7 +140,7 @@ class History(Record):
         return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(progress.seconds))
 
 
-class Optimisation(eqx.Module):
+class Optimisation(eqx.Module, Printed):
     """The result of a run, or of one run per seed; all fields but the seconds then have a leading axis.
 
     Attributes:
@@ -171,3 +172,15 @@ class Optimisation(eqx.Module):
     num_gradient_rollouts: Int[np.ndarray, "..."]
     seconds: float
     compile_seconds: float
+
+    def __str__(self) -> str:
+        steps, rollouts, skipped = (
+            format_range((float(np.min(x)), float(np.max(x))))
+            for x in (self.num_steps, self.num_rollouts, self.num_skipped)
+        )
+        low, high = (f"{x:.4g}" for x in (np.min(self.best_cost), np.max(self.best_cost)))
+        cost = low if low == high else f"{low} to {high}"
+        runs = [jax.tree.map(lambda x, i=i: jnp.ravel(x)[i], self.stopped) for i in range(np.size(self.num_steps))]
+        reasons = "; ".join(dict.fromkeys(Stopped[run] for run in runs))
+        spent = f"{self.seconds:.3g} s, and {self.compile_seconds:.3g} s to compile"
+        return f"Best cost {cost} after {steps} steps, {skipped} skipped: {reasons}. {rollouts} rollouts took {spent}."

@@ -88,9 +88,14 @@ class Restored(eqx.Module):
         return self.function(self.restore(vector))
 
 
-def flattened(params: PyTree) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; or an array, None."""
-    if eqx.is_array_like(params):
+def flattened(
+    params: PyTree, num_axes: int = 1
+) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
+    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; or a vector, None.
+
+    An array with more axes than a vector, or than one vector per seed, is a pytree, too: controls by step and actuator.
+    """
+    if eqx.is_array_like(params) and jnp.ndim(params) <= num_axes:
         return jnp.asarray(params), None
     # `is_inexact_array_like` calls a tracer's `__jax_array__`, which is None (jax 0.10.2, equinox 0.13.8).
     is_parameter = lambda x: eqx.is_inexact_array(x) if eqx.is_array(x) else eqx.is_inexact_array_like(x)  # noqa: E731

@@ -26,7 +26,8 @@ def sequence_of(
     controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
 ) -> tuple[Array | None, int]:
     """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
-    sequence = None if controls is None or callable(controls) else jnp.asarray(controls)
+    sequence = None if controls is None or callable(controls) else _real("controls", controls)
+    noise = None if noise is None else _real("noise", noise)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
     for name, value in (("controls", sequence), ("noise", noise)):
         if value is None:
@@ -39,6 +40,13 @@ def sequence_of(
             row, column = np.argwhere(~np.isfinite(numbers))[0]
             raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")
     return sequence, horizon
+
+
+def _real(name: str, value: Any) -> Array:
+    dtype = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
+    if not jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.complexfloating):
+        raise ValueError(f"{name} must be real numbers, got {dtype}")
+    return jnp.asarray(value)
 
 
 def check_shapes(scene: Scene, state: State) -> None:

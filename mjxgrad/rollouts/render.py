@@ -105,7 +105,9 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     except ImportError as error:
         raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
-    path = Path(path)
+    path, video = Path(path), np.asarray(video)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"path must be in an existing folder, got {path}")
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     # Compressed to memory: a full disk then raises Python's own OSError, not a page of ffmpeg's output.
     even = video[:, : video.shape[1] // 2 * 2, : video.shape[2] // 2 * 2]

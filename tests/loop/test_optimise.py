@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +133,20 @@ def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
 
 def is_odd(key):
     return jax.random.key_data(key).sum() % 2 == 1
+
+
+def test_a_run_that_never_took_a_step_does_not_say_that_all_were_done(key):
+    result = run(key, lambda *_: made_up([jnp.nan, 0.0]), num_steps=3)
+    assert result.stopped == mg.Stopped.not_finite
+
+
+def test_a_result_is_shown_as_a_sentence(zeroth_order_run):
+    shown = []
+    zeroth_order_run._repr_pretty_(SimpleNamespace(text=shown.append), cycle=False)
+    assert shown == [str(zeroth_order_run)]
+    assert shown[0].startswith(
+        f"Best cost {float(zeroth_order_run.best_cost):.4g} after 250 steps, 0 skipped: all steps were done"
+    )
 
 
 def test_a_run_gives_up_after_steps_in_a_row_that_are_not_finite(key):

@@ -21,6 +21,7 @@ class Gains(eqx.Module):
 
 
 FORMS = {
+    "matrix": (lambda x: x[:, None], lambda form: form[:, 0]),
     "dict": (lambda x: {"a": x[:1], "b": x[1]}, lambda form: jnp.append(form["a"], form["b"])),
     "module": (
         lambda x: Gains(x[:1], x[1], jnp.tanh, 3),
@@ -56,6 +57,7 @@ def test_the_run_is_that_of_the_vector(key, form, is_annealed):
     np.testing.assert_allclose(tree.history.noise_free_cost, vector.history.noise_free_cost, rtol=1e-10)
 
 
+@pytest.mark.parametrize("form", ["dict", "module"], indirect=True)  # a matrix would be one vector per seed
 def test_many_seeds_have_their_axis_first(key, form):
     there, back, cost = form
     keys = jax.random.split(key, 3)
