@@ -81,7 +81,13 @@ class ActionNoise(Objective):
         actions, drawn = jnp.zeros(self.noise_shape, self.stddev.dtype), self._start_shape()
         if drawn is None:
             return actions
-        return actions, jax.tree.map(lambda like, leaf: jnp.asarray(leaf, like.dtype), drawn, self.task.nominal_start())
+        nominal = self.task.nominal_start()
+        if jax.tree.structure(nominal) != jax.tree.structure(drawn):
+            raise ValueError(
+                f"nominal_start must have the structure of sample_start, {jax.tree.structure(drawn)}, "
+                f"got {jax.tree.structure(nominal)}"
+            )
+        return actions, jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), nominal, drawn)
 
     def split(self, noise: PyTree) -> tuple[Float[Array, "horizon nu"], PyTree]:
         """Return the action noise and the start, None where the start is not random."""

@@ -45,6 +45,15 @@ def test_a_random_start_is_where_the_rollout_begins(objective, params, key):
     assert not np.allclose(noise[1], objective.task.start)
 
 
+def test_a_nominal_start_built_unlike_the_random_ones_is_refused():
+    class Forgetful(textbook.RandomStart):
+        def nominal_start(self):
+            return None
+
+    with pytest.raises(ValueError, match="nominal_start must have the structure of sample_start"):
+        open_loop(Forgetful(), STDDEV).zero_noise()
+
+
 def test_a_control_answers_for_its_own_step_and_those_after():
     task = textbook.LinearSystem()
     slopes = jax.jacobian(lambda controls: task.run(controls).step_costs)(CONTROLS)[..., 0]
