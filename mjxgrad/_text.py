@@ -26,10 +26,10 @@ def aligned(rows: Sequence[Sequence[str]], align: Callable[[str, int], str] = st
     return ["  ".join([row[0].ljust(widths[0]), *map(align, row[1:], widths[1:])]).rstrip() for row in rows]
 
 
-def format_range(pair: Iterable[float]) -> str:
+def format_range(pair: Iterable[float], between: str = "–") -> str:
     """Return two numbers as a range, or as one if they are equal."""
     low, high = (f"{x:.4g}" for x in pair)
-    return low if low == high else f"{low}–{high}"
+    return low if low == high else f"{low}{between}{high}"
 
 
 def format_number(x: float) -> str:

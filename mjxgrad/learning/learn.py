@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from mjxgrad._text import Printed
+from mjxgrad._text import Printed, format_range
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import ActorCritic, Learner, Policy
 from mjxgrad.learning.settings import Settings
@@ -49,8 +49,8 @@ class Learned(eqx.Module, Printed):
     def __str__(self) -> str:
         reward, agreement = (np.asarray(self.history[name]) for name in ("reward", "agreement"))
         late = slice(-max(1, len(reward) // 10), None)
-        low, high = (f"{x:.4g}" for x in (reward[late].mean(axis=0).min(), reward[late].mean(axis=0).max()))
-        rewards = low if low == high else f"{low} to {high}"
+        mean = reward[late].mean(axis=0)
+        rewards = format_range((float(mean.min()), float(mean.max())), " to ")
         agreed = f"halves of the environments agree to {np.nanmean(agreement[late]):.2f}"
         seconds = np.asarray(self.history["seconds"]).reshape(len(reward), -1)[:, 0].sum()
         return f"Reward {rewards} a step in the last of {len(reward)} updates, {seconds:.3g} s; {agreed}."

@@ -178,8 +178,7 @@ class Optimisation(eqx.Module, Printed):
             format_range((float(np.min(x)), float(np.max(x))))
             for x in (self.num_steps, self.num_rollouts, self.num_skipped)
         )
-        low, high = (f"{x:.4g}" for x in (np.min(self.best_cost), np.max(self.best_cost)))
-        cost = low if low == high else f"{low} to {high}"
+        cost = format_range((float(np.min(self.best_cost)), float(np.max(self.best_cost))), " to ")
         runs = [jax.tree.map(lambda x, i=i: jnp.ravel(x)[i], self.stopped) for i in range(np.size(self.num_steps))]
         reasons = "; ".join(dict.fromkeys(Stopped[run] for run in runs))
         spent = f"{self.seconds:.3g} s, and {self.compile_seconds:.3g} s to compile"
