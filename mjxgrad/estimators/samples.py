@@ -223,7 +223,8 @@ class Group(eqx.Module):
     @classmethod
     def of(cls, samples: Samples) -> "Group":
         per_unit = samples.rollouts.cost.shape[1]
-        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), samples.rollouts)
+        # The number of rows is given: a parameter without entries leaves nothing from which to find it.
+        flat = jax.tree.map(lambda leaf: leaf.reshape(samples.rollouts.cost.size, *leaf.shape[2:]), samples.rollouts)
         raw, gradients = flat.cost, flat.gradient_by_noise
         has_cost = jnp.repeat(samples.is_noisy, per_unit) & jnp.isfinite(raw)
         has_derivative = has_cost & jnp.isfinite(gradients).all(axis=1)
