@@ -24,19 +24,17 @@ from experiments.words import capitalised, joined, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
-from mjxgrad.estimators.rules import FixedAlpha, InverseVariance
 
-Method = Literal["onset", "discrete", "slope", "alpha", "inverse_variance", "zeroth", "ppo"]
+Method = Literal["onset", "discrete", "slope", "alpha", "zeroth", "ppo"]
 NAMES = {
     "onset": "first order with an onset",
     "discrete": "first order",
     "slope": "first order by the slope",
     "alpha": "α-order",
-    "inverse_variance": "weighed by variance",
     "zeroth": "zeroth order",
     "ppo": "PPO",
 }
-_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", ONSET, "#6b6ecf", ZEROTH, "#777777"), strict=True))
+_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", ONSET, ZEROTH, "#777777"), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped", "trot"]
 _LOADERS: dict[str, Callable[..., Environment]] = {
     "quadruped": quadruped,
@@ -301,7 +299,6 @@ def _judged_course(
 
 
 def _how(settings: Settings, method: Method) -> learning.Settings:
-    rules = {"alpha": learning.Settings().rule, "inverse_variance": InverseVariance(), "zeroth": FixedAlpha(0.0)}
     changes: dict[str, Any] = {} if settings.actor_rate is None else {"actor_rate": settings.actor_rate}
     return (apg if settings.algorithm == "apg" else learning.Settings)(
         num_environments=settings.sizes.num_environments,
@@ -309,7 +306,7 @@ def _how(settings: Settings, method: Method) -> learning.Settings:
         critic_rate=settings.critic_rate,
         trace=settings.trace,
         largest_sample=settings.largest_sample,
-        rule=rules.get(method, FixedAlpha(1.0)),
+        alpha={"alpha": None, "zeroth": 0.0}.get(method, 1.0),
         **changes,
     )
 

@@ -1,20 +1,19 @@
 r"""Policies learned from short windows: SHAC, its α-order form, and the likelihood ratio, in one loop.
 
-An update runs one window in every environment (see `window`) and moves the policy along a mixture of both gradients. It then
-fits the value function to TD($\lambda$) targets. The methods differ only in the mixing rule:
+An update runs one window in every environment (see `window`) and moves the policy along a mixture of both gradients (see
+`mixing`). It then fits the value function to TD($\lambda$) targets. The methods differ only in the weight of first order:
 
-| `rule` | method |
+| `alpha` | method |
 |---|---|
-| `rules.FixedAlpha(1)` | first order: SHAC, with the blended adjoint of `window` |
-| `rules.FixedAlpha(0)` | zeroth order: REINFORCE with a value function |
-| `rules.InverseVariance()` | both, by variance, for every step and action: IVW-H |
-| `rules.Consistent(failure_probability=1e-3)` | the same with a test for bias: α-order, the default |
+| 1 | first order: SHAC, with the blended adjoint of `window` |
+| 0 | zeroth order: REINFORCE with a value function |
+| None | both, with the least error: α-order, the default |
 
 Without a value function (`has_critic=False, trace=1.0`) first order is analytic policy gradients (APG).
 
 References:
     Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin. Accelerated Policy Learning with Parallel Differentiable Simulation.
-    ICLR 2022, arXiv:2204.07137 (SHAC). Onoda et al., arXiv:2604.18161 (IVW-H).
+    ICLR 2022, arXiv:2204.07137 (SHAC).
 """
 
 from collections.abc import Sequence
@@ -71,10 +70,10 @@ def learn(
     The history has one number per update for each of these names:
 
     - `reward`, mean per step; `return`, mean over the episodes that ended, NaN without any;
-    - `alpha`, mean weight of first order; `gradient_norm`, norm of the gradient by the parameters;
+    - `alpha`, weight of first order; `gradient_norm`, norm of the gradient by the parameters;
     - `agreement`, cosine between the gradients of two halves of the environments: near 0 they are noise;
-    - `first_variance` and `zeroth_variance`, variances of one environment's gradient by its actions; `squared_bias`, squared
-      difference of their means minus the part that noise explains, which may be negative;
+    - `cosine`, between the means of both gradients, of the last twenty updates: far below 1 derivatives are biased;
+    - `first_variance` and `zeroth_variance`, of both gradients by the parameters, from the two halves;
     - `ended`, share of windows in which an episode ended for good: no derivative passes such an end;
     - `not_finite`, share of first-order gradients that were not finite; `shortened`, share of those that were too large, see
       `Settings.largest_sample`; `diverged`, number of steps without a meaningful next state;

@@ -15,9 +15,10 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
+from mjxgrad.learning.mixing import Halves, Products
 from mjxgrad.learning.networks import FINAL_SCALE, Network, Normaliser, ValueFunction
 from mjxgrad.learning.settings import Settings
-from mjxgrad.learning.window import Gradients, Window, lambda_returns, mix, window_gradients
+from mjxgrad.learning.window import Gradients, Window, lambda_returns, window_gradients
 from mjxgrad.loop.run import Method
 
 Metrics = dict[str, Float[Array, ""]]
@@ -51,6 +52,7 @@ class Learner(eqx.Module):
         target: the target value function, which follows the critic and replaces it in targets and gradients.
         actor_moments: state of the policy's optimiser.
         critic_moments: state of the value function's optimiser.
+        products: what is known of both gradients, which decides their weights.
         environments: state of each copy of the environment.
         model_keys: key of each copy's randomised model.
         episode_return: return so far of each running episode.
@@ -63,6 +65,7 @@ class Learner(eqx.Module):
     target: ValueFunction
     actor_moments: optax.OptState
     critic_moments: optax.OptState
+    products: Products
     environments: EnvState
     model_keys: Key[Array, " environments"]
     episode_return: Float[Array, " environments"]
@@ -107,6 +110,7 @@ class ActorCritic(Method):
             target=critic,
             actor_moments=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
             critic_moments=critic_optimiser.init(eqx.filter(critic.network, eqx.is_array)),
+            products=Products.none(),
             environments=environments,
             model_keys=model_keys,
             episode_return=jnp.zeros(count),
@@ -121,7 +125,7 @@ class ActorCritic(Method):
         first, last = settings.stddev
         stddev = first + (last - first) * learner.num_updates / self.num_updates
         window, environments, gradients = self._windows(learner, environments, noise_key, stddev)
-        policy, actor_moments, found = self._improve(learner, window, gradients)
+        policy, actor_moments, products, found = self._improve(learner, window, gradients)
         critic, target, critic_moments = learner.critic, learner.target, learner.critic_moments
         critic_loss = jnp.zeros(())
         if settings.has_critic:
@@ -134,6 +138,7 @@ class ActorCritic(Method):
             target=target,
             actor_moments=actor_moments,
             critic_moments=critic_moments,
+            products=products,
             environments=environments,
             episode_return=episode_return,
             num_updates=learner.num_updates + 1,
@@ -184,22 +189,28 @@ class ActorCritic(Method):
 
     def _improve(
         self, learner: Learner, window: Window, gradients: Gradients
-    ) -> tuple[Policy, optax.OptState, Metrics]:
-        """Return the policy moved along the mixture, if that is finite, with its optimiser's state and the metrics."""
+    ) -> tuple[Policy, optax.OptState, Products, Metrics]:
+        """Return the policy moved along the mixture, if that is finite, its optimiser's state, products and metrics."""
         policy = learner.policy
-        gradients, is_shortened = gradients.shortened(self.settings.largest_sample)
-        mixture, weights, evidence = mix(gradients, self.settings.rule)
+        shortened, is_shortened = gradients.shortened(self.settings.largest_sample)
 
         def acted(actor: Network) -> Float[Array, "environments steps nu"]:
             return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(window.obs)
 
         _, pull_back = jax.vjp(acted, policy.actor)
         count = self.settings.num_environments
-        is_first = jnp.arange(count) < count // 2
-        # Optimisers descend, so the gradient is that of the negative mean return per step; of each half of the environments.
-        slope = -mixture / (count * self.settings.window)
-        halves = [pull_back(jnp.where(own[:, None, None], slope, 0))[0] for own in (is_first, ~is_first)]
-        gradient = optax.tree.add(*halves)
+        is_first = (jnp.arange(count) < count // 2)[:, None, None]
+
+        def halves(by_action: Float[Array, "environments steps nu"]) -> Halves:
+            # Optimisers descend, so the gradient is that of the negative mean return per step.
+            slope = -by_action / (count * self.settings.window)
+            return pull_back(jnp.where(is_first, slope, 0))[0], pull_back(jnp.where(is_first, 0, slope))[0]
+
+        first, zeroth = halves(shortened.sound.first), halves(shortened.zeroth)
+        products = learner.products.with_more(first, zeroth)
+        alpha = products.weight() if self.settings.alpha is None else jnp.asarray(self.settings.alpha)
+        mixed = jax.tree.map(lambda d, z: alpha * d + (1 - alpha) * z, first, zeroth)
+        gradient = optax.tree.add(*mixed)
         norm = optax.tree.norm(gradient)
         is_finite = jnp.isfinite(norm)
         optimiser, _ = optimisers(self.settings, self.num_updates)
@@ -208,17 +219,17 @@ class ActorCritic(Method):
             lambda x, y: jnp.where(is_finite, x, y), new, (policy.actor, learner.actor_moments)
         )
         found = {
-            "alpha": weights.alpha.mean(),
+            "alpha": alpha,
             "gradient_norm": norm,
-            "agreement": optax.tree.vdot(*halves) / math.prod(map(optax.tree.norm, halves)),
-            "first_variance": evidence.first_variance.sum(),
-            "zeroth_variance": evidence.zeroth_variance.sum(),
-            "squared_bias": (evidence.difference_norm**2 - evidence.difference_variance / evidence.real_count).sum(),
+            "agreement": optax.tree.vdot(*mixed) / math.prod(map(optax.tree.norm, mixed)),
+            "cosine": products.cosine,
+            "first_variance": optax.tree.norm(optax.tree.sub(*first), squared=True),
+            "zeroth_variance": optax.tree.norm(optax.tree.sub(*zeroth), squared=True),
             "not_finite": (~gradients.is_finite).mean(),
             "shortened": is_shortened.mean(),
             "skipped": (~is_finite).astype(norm.dtype),
         }
-        return Policy(actor, policy.normaliser), moments, found
+        return Policy(actor, policy.normaliser), moments, products, found
 
     def _fit_critic(
         self, learner: Learner, window: Window, key: PRNGKeyArray

@@ -3,7 +3,6 @@
 import dataclasses
 
 from mjxgrad.batched.device import is_gpu
-from mjxgrad.estimators.rules import Consistent, Rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,8 +15,8 @@ class Settings:
         discount: discount per step.
         trace: λ of the returns that the policy climbs, see `window`: 1 differentiates through the whole window (SHAC), 0 through
             one step and the value function after it.
-        rule: map from the evidence of a step and action to the weight of its first-order gradient. Many are asked, so the
-            default's failure probability is small.
+        alpha: weight of first order, from 0 to 1: 1 is SHAC, 0 has no derivatives. None takes that of the least error in each
+            update, see `mixing`: α-order.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
         actor_layers: hidden sizes of the policy.
         actor_scale: factor of the initial gains of the policy's hidden layers.
@@ -38,8 +37,8 @@ class Settings:
     window: int = 16
     discount: float = 0.99
     trace: float = 0.9
-    rule: Rule = dataclasses.field(default_factory=lambda: Consistent(failure_probability=1e-3))
-    stddev: tuple[float, float] = (0.4, 0.1)
+    alpha: float | None = None
+    stddev: tuple[float, float] = (0.4, 0.25)
     actor_layers: tuple[int, ...] = (128, 64, 32)
     actor_scale: float = 1.0
     critic_layers: tuple[int, ...] = (64, 64)
@@ -55,7 +54,9 @@ class Settings:
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("discount", "trace"):
+        for name in ("discount", "trace", "alpha"):
+            if name == "alpha" and self.alpha is None:
+                continue
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
         if self.trace < 1 and not self.has_critic:

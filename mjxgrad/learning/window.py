@@ -15,11 +15,11 @@ $\lambda p + (1 - \lambda) \gamma^t \nabla V$, so that derivatives reach $1/(1 -
 $\lambda = 1$ it is that of $J$; with $\lambda = 0$ that of one step. In zeroth order $A_t$ is $G_t - V(o_t)$.
 
 The mean of the second is the gradient of $J$; so is the mean of the first where nothing jumps. One pull-back takes either to
-the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. The two can therefore be
-compared and mixed by step and action, and a derivative that is not finite is found where it arises.
+the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. A derivative that is not finite
+is therefore found where it arises, and zeroth order takes its place. `mixing` says how both are mixed.
 
 References:
-    Those of `learn`: Xu et al. for the window, Onoda et al. for the mixture by step. Hafner, Lillicrap, Ba, Norouzi. Dream to
+    Those of `learn`: Xu et al. for the window. Hafner, Lillicrap, Ba, Norouzi. Dream to
     Control. ICLR 2020, arXiv:1912.01603, for the objective of the blended adjoint.
 """
 
@@ -33,8 +33,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.estimators.moments import Moments
-from mjxgrad.estimators.rules import Evidence, Rule, Weights
 from mjxgrad.learning.networks import Network, Normaliser
 
 Value = Callable[[Float[Array, " obs"]], Float[Array, ""]]
@@ -80,6 +78,11 @@ class Gradients(eqx.Module):
     first: Float[Array, "*environments steps nu"]
     zeroth: Float[Array, "*environments steps nu"]
     is_finite: Bool[Array, "*environments steps"]
+
+    @property
+    def sound(self) -> "Gradients":
+        """These gradients, with zeroth order in place of a first order that is not finite."""
+        return dataclasses.replace(self, first=jnp.where(self.is_finite[..., None], self.first, self.zeroth))
 
     def shortened(self, most: float) -> tuple["Gradients", Bool[Array, "environments steps"]]:
         """Return first-order gradients of at most `most` zeroth-order root mean squares, and which were shortened.
@@ -201,24 +204,3 @@ def window_gradients(
     advantages = lambda_returns(window, value, discount, trace) - jax.vmap(value)(window.obs)
     zeroth = (weights_in_return(window, discount) * advantages)[:, None] * noise / stddev
     return window, final, Gradients(first, zeroth, jnp.isfinite(first).all(axis=1))
-
-
-def mix(gradients: Gradients, rule: Rule) -> tuple[Float[Array, "environments steps nu"], Weights, Evidence]:
-    """Return the mixture of both gradients by step and action, the rule's weights, and the evidence for them.
-
-    Where a first-order gradient is not finite, the zeroth-order one replaces it. Costs are not compared (`inconsistency` is
-    zero), since no two environments share a start.
-    """
-
-    def found(first: Array, zeroth: Array, is_finite: Array) -> Evidence:
-        everywhere = jnp.ones_like(is_finite)
-        parts = Moments.of(first, is_finite), Moments.of(zeroth, everywhere), Moments.of(zeroth - first, is_finite)
-        return Evidence.of(*parts, inconsistency=jnp.zeros((), first.dtype))
-
-    by_action = jax.vmap(found, in_axes=(1, 1, None))
-    evidence = jax.vmap(by_action, in_axes=1)(gradients.first, gradients.zeroth, gradients.is_finite)
-    weights = jax.vmap(jax.vmap(rule))(evidence)
-    alpha = jnp.where(evidence.count >= 2, weights.alpha, 0)
-    share = jnp.where(gradients.is_finite[..., None], alpha, 0)
-    derivative = jnp.where(gradients.is_finite[..., None], gradients.first, 0)
-    return share * derivative + (1 - share) * gradients.zeroth, eqx.tree_at(lambda w: w.alpha, weights, alpha), evidence

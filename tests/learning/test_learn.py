@@ -18,7 +18,6 @@ from numpy.testing import assert_allclose
 
 from mjxgrad import envs, initial_state, learning
 from mjxgrad.envs.diffrl import CartPole
-from mjxgrad.estimators.rules import FixedAlpha
 from mjxgrad.learning.learner import ActorCritic
 from mjxgrad.loop import side_by_side
 
@@ -177,7 +176,7 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     """The gradient of one update against that of a plain sum over windows, and of both halves; with hardly any noise."""
     settings = learning.Settings(
         num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf,
-        discount=1.0, trace=1.0, rule=FixedAlpha(1.0), has_critic=False,
+        discount=1.0, trace=1.0, alpha=1.0, has_critic=False,
     )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
     before = ActorCritic(cartpole, settings, 1).init(key)
@@ -301,7 +300,7 @@ def test_several_devices_and_processes_learn_the_same(tmp_path):
 @pytest.mark.slow
 def test_a_swing_up_is_learned_in_minutes(cartpole):
     """Upright, within 0.2 rad, in the last second in C MuJoCo, from nine of ten starts."""
-    settings = learning.Settings(rule=FixedAlpha(1.0))
+    settings = learning.Settings(alpha=1.0)
     run = learning.learn(cartpole, jax.random.key(0), num_updates=1200, settings=settings)
     judged = learning.evaluate(cartpole, run.policy, jax.random.key(1), num_episodes=20)
     assert np.mean(np.all(np.cos(judged.qpos[:, -60:, 1]) > np.cos(0.2), axis=1)) >= 0.9

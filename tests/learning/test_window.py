@@ -13,7 +13,6 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import mjxgrad as mg
 from mjxgrad import envs
-from mjxgrad.estimators.rules import Consistent, FixedAlpha, InverseVariance
 from mjxgrad.learning import learner
 from mjxgrad.learning.networks import Network, Normaliser
 from mjxgrad.learning.window import (
@@ -21,7 +20,6 @@ from mjxgrad.learning.window import (
     Window,
     _faded,
     lambda_returns,
-    mix,
     returned,
     run_window,
     window_gradients,
@@ -264,29 +262,9 @@ def random_gradients(*, bad=()):
     return Gradients(jnp.asarray(first), jnp.asarray(zeroth), jnp.asarray(is_finite))
 
 
-def test_fixed_weights_give_either_gradient_and_inverse_variance_is_by_step():
-    both = random_gradients()
-    assert_allclose(mix(both, FixedAlpha(1.0))[0], both.first)
-    assert_allclose(mix(both, FixedAlpha(0.0))[0], both.zeroth)
-    _, weights, _ = mix(both, InverseVariance())
-    first, zeroth = (np.var(x, axis=0, ddof=1) for x in (both.first, both.zeroth))
-    assert_allclose(weights.alpha, zeroth / (zeroth + first))
-
-
-def test_a_bias_moves_the_weight_from_the_first_order():
-    """Ten standard errors of the difference apart."""
-    both = random_gradients()
-    biased = Gradients(both.first + 5.0, both.zeroth, both.is_finite)
-    assert np.all(mix(biased, Consistent())[1].alpha < 0.5 * mix(both, Consistent())[1].alpha)
-
-
 def test_the_zeroth_order_stands_in_for_what_is_no_number():
     both = random_gradients(bad=[(3, 1)])
-    mixture, weights, _ = mix(both, FixedAlpha(1.0))
-    assert_allclose(mixture[3, 1], both.zeroth[3, 1])
-    assert_allclose(mixture[3, 0], both.first[3, 0])
-    assert np.isfinite(mix(both, InverseVariance())[0]).all()
-    assert np.isfinite(weights.alpha).all()
+    assert_allclose(both.sound.first, both.first.at[3, 1].set(both.zeroth[3, 1]))
 
 
 def test_what_is_longer_than_zeroth_order_noise_is_shortened_and_counted():
