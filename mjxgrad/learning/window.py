@@ -15,8 +15,8 @@ $\lambda p + (1 - \lambda) \gamma^t \nabla V$, so that derivatives reach $1/(1 -
 $\lambda = 1$ it is that of $J$; with $\lambda = 0$ that of one step. In zeroth order $A_t$ is $G_t - V(o_t)$.
 
 The mean of the second is the gradient of $J$; so is the mean of the first where nothing jumps. One pull-back takes either to
-the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. A derivative that is not finite
-is therefore found where it arises, and zeroth order takes its place. `mixing` says how both are mixed.
+the parameters, $\sum_t (\partial\mu_\theta/\partial\theta)^\top g_t$ at the recorded observations. A derivative that is not
+finite is therefore found where it arises, and zeroth order takes its place. `mixing` says how both are mixed.
 
 References:
     Those of `learn`: Xu et al. for the window. Hafner, Lillicrap, Ba, Norouzi. Dream to
