@@ -50,7 +50,8 @@ def frames(
         speed: simulated over shown time; 0.25 is four times slower than real.
         height: height in pixels.
         width: width in pixels.
-        camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view.
+        camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view, which goes along
+            with a body that would leave it.
 
     Returns:
         The frames.
@@ -69,19 +70,37 @@ def frames(
     mj_model.vis.global_.offheight = max(height, mj_model.vis.global_.offheight)
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
     data = mujoco.MjData(mj_model)
-    view = -1 if camera is None else camera
     last, states_per_frame = len(positions) - 1, speed / fps / timestep
     # The last state counts as reached despite rounding in its time.
     shown = np.arange(int(last / states_per_frame + 1e-6) + 1)
     nearest = np.minimum(np.rint(shown * states_per_frame).astype(int), last)
-    drawn = []
+    view, drawn = mujoco.MjvCamera(), []
+    mujoco.mjv_defaultFreeCamera(mj_model, view)
+    moves = _moves(mj_model, data, positions[nearest]) if camera is None else np.zeros((len(nearest), 3))
+    first = view.lookat.copy()
     with _renderer(mj_model, height, width) as renderer:
-        for state in nearest:
+        for state, move in zip(nearest, moves, strict=True):
             data.qpos[:] = positions[state]
             mujoco.mj_fwdPosition(mj_model, data)
-            renderer.update_scene(data, view)
+            view.lookat = first + move
+            renderer.update_scene(data, view if camera is None else camera)
             drawn.append(renderer.render())
     return np.stack(drawn)
+
+
+def _moves(
+    mj_model: mujoco.MjModel, data: mujoco.MjData, positions: Float[np.ndarray, "frames nq"]
+) -> Float[np.ndarray, "frames 3"]:
+    """Return how far the body that goes farthest has gone along the floor; zero if it stays within the scene's extent."""
+    places = []
+    for data.qpos[:] in positions:
+        mujoco.mj_kinematics(mj_model, data)
+        places.append(data.xpos.copy())
+    gone = np.stack(places) - places[0]
+    gone[..., 2] = 0.0
+    farthest = np.linalg.norm(gone, axis=-1).max(axis=0).argmax()
+    moves = gone[:, farthest]
+    return moves if np.linalg.norm(moves, axis=-1).max() > mj_model.stat.extent else np.zeros_like(moves)
 
 
 def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:

@@ -6,6 +6,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from experiments.video import tile
 from mjxgrad.rollouts.render import RenderingUnavailableError, frames, write_video
@@ -53,6 +54,14 @@ def test_the_picture_follows_the_state(model):
     assert abs(middle) < 0.02
     assert left == pytest.approx(-right, abs=0.02)
     assert right > 0.2
+
+
+@pytest.mark.usefixtures("opengl")
+def test_the_default_view_goes_along_with_what_would_leave_it(model):
+    """Twenty metres along the floor end where they began in the picture; a tenth of a metre is seen as a move."""
+    far, near = (frames(model, np.array([[0.0], [x]]), timestep=1, fps=1, height=60, width=80) for x in (20.0, 0.1))
+    assert_array_equal(far[1], far[0])
+    assert abs(centres(near)[1] - centres(near)[0]) > 0.02
 
 
 @pytest.mark.usefixtures("opengl")
