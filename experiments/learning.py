@@ -14,6 +14,7 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
+from experiments.problems.pusher import pusher
 from experiments.problems.quadruped import quadruped
 from experiments.problems.trot import apg, trot
 from experiments.report import MOST_WORDS, Table
@@ -35,13 +36,10 @@ NAMES = {
     "ppo": "PPO",
 }
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", ONSET, ZEROTH, "#777777"), strict=True))
-Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "quadruped", "trot"]
-_LOADERS: dict[str, Callable[..., Environment]] = {
-    "quadruped": quadruped,
-    "trot": trot,
-    **{name: getattr(envs.diffrl, name) for name in get_args(Name) if name not in ("quadruped", "trot")},
-}
-_OWN_STEPS = ("cartpole", "quadruped", "trot")  # whose time steps are their own
+Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot"]
+_OURS: dict[str, Callable[..., Environment]] = {"pusher": pusher, "quadruped": quadruped, "trot": trot}
+_LOADERS = {name: _OURS.get(name) or getattr(envs.diffrl, name) for name in get_args(Name)}
+_OWN_STEPS = ("cartpole", *_OURS)  # whose time steps are their own
 _SHOWN = 8.0  # s of an episode
 _FINER = 8  # times, by which time steps are shorter where a policy is judged a second time
 
@@ -63,7 +61,7 @@ class Settings(RunSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
     environment: Name
-    """What is learned: DiffRL's tasks, a quadruped that follows commands, or the trot of MuJoCo's notebook."""
+    """What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, or the trot of MuJoCo's notebook."""
     algorithm: Literal["shac", "apg"] = "shac"
     """SHAC, or analytic policy gradients as in brax: no value function, other networks and rates."""
     methods: Annotated[tuple[Method, ...], Field(min_length=1)]
@@ -71,7 +69,7 @@ class Settings(RunSettings):
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
     """By which contact is stiffer than in the scene."""
     num_substeps: Annotated[int, Field(ge=1)] | None = None
-    """Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, quadruped and trot have their own."""
+    """Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, pusher, quadruped and trot have their own."""
     window: Annotated[int, Field(ge=1)] = learning.Settings.window
     """Steps of each environment per update."""
     actor_rate: Positive | None = None
@@ -529,8 +527,8 @@ def quality(outcome: Outcome):
     axes[0, 2].set_ylim(-0.05, 1.05)
     legend_below(figure, axes[0, 0], 3)
     caption = (
-        "Left and middle, variance of one environment's gradient by its actions, summed over them, both from the same windows. "
-        "Right, mean weight of the first order. Means over seeds and ten updates, of the variances geometric ones."
+        "Left and middle, variance of an update's gradient by the policy's parameters, both from the same windows. "
+        "Right, weight of the first order. Means over seeds and ten updates, of the variances geometric ones."
     )
     return figure, "Quality of the gradients", caption
 
@@ -545,7 +543,10 @@ def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[
         "episode at most."
     )
     model = with_coarse_shadows(environment.scene.to_mujoco())
-    camera = "side" if outcome.settings.environment == "cartpole" else "track"
+    camera = {"cartpole": "side", "pusher": "above"}.get(outcome.settings.environment, "track")
+    if camera == "above":  # the target of the episode
+        start = jax.random.split(jax.random.key(outcome.settings.seed + 1), outcome.settings.sizes.num_episodes)[0]
+        model.body("target").pos[:2] = environment.reset(start).memory
     return film(workspace, [(model, shown)], look, camera=camera, caption=caption, timestep=interval)
 
 

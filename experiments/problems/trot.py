@@ -25,7 +25,6 @@ from mjxgrad import learning
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs import Environment
-from mjxgrad.estimators.rules import FixedAlpha
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.rollouts.state import data_of
 from mjxgrad.scene import load_scene
@@ -162,7 +161,7 @@ def apg(**changes: Any) -> learning.Settings:
     settings = {
         "discount": 1.0,
         "trace": 1.0,
-        "rule": FixedAlpha(1.0),
+        "alpha": 1.0,
         "stddev": (0.07, 0.01),
         "actor_layers": (256, 128),
         "actor_scale": 0.01,
