@@ -52,7 +52,7 @@ class Learner(eqx.Module):
         target: the target value function, which follows the critic and replaces it in targets and gradients.
         actor_moments: state of the policy's optimiser.
         critic_moments: state of the value function's optimiser.
-        products: what is known of both gradients, which decides their weights.
+        products: running products of both gradients, which decide their weights.
         environments: state of each copy of the environment.
         model_keys: key of each copy's randomised model.
         episode_return: return so far of each running episode.
