@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad._arrays import known
-from mjxgrad._programs import compiled
+from mjxgrad._programs import compiled, is_traced
+from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 
@@ -47,7 +48,7 @@ class Iterations(eqx.Module):
     promised: _Row
 
 
-class Plan(eqx.Module):
+class Plan(eqx.Module, Printed):
     """The controls of least cost that were found; under `jax.vmap` every field gains leading axes.
 
     Attributes:
@@ -81,6 +82,12 @@ class Plan(eqx.Module):
         if self.diverged:
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
         return "converged" if self.converged else "not converged; take more iterations"
+
+    def __str__(self) -> str:
+        if is_traced(self.cost) or self.cost.ndim:
+            return repr(self)
+        cost, before = (format_number(float(x)) for x in (self.cost, self.start_cost))
+        return f"Cost {cost} from {before} in {self.iterations.cost.size} iterations: {self.verdict()}."
 
 
 class Feedback(eqx.Module):
