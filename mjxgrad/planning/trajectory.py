@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
-from mjxgrad._arrays import known
+from mjxgrad._arrays import instance, known, one_key
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import LinearModel, Smoother
@@ -187,12 +187,15 @@ def optimise_trajectory(
         UserWarning: if the smoothing reaches contacts with friction that hold bodies to the floor.
 
     Raises:
-        ValueError: if shapes do not fit, a limit is above its opposite, or the schedule is empty or not positive.
+        ValueError: if shapes do not fit, a limit is above its opposite, an argument is of another kind or not finite, or the
+            schedule is empty or not positive.
 
     References:
         Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143 (iLQR on
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
+    one_key(key)
+    instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
     start, controls = jnp.asarray(start), jnp.asarray(controls)
     factors = jnp.asarray(schedule, start.dtype)
     lower, upper = system.limits(lower, upper, start.dtype)
@@ -203,6 +206,8 @@ def optimise_trajectory(
         raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
     if factors.ndim != 1 or not factors.size:
         raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
+    if (values := known(controls)) is not None and not np.isfinite(values).all():
+        raise ValueError("controls must be finite, got some that are not")
     given, low, high = known(factors), known(lower), known(upper)
     if given is not None and not (given > 0).all():
         raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")

@@ -15,6 +15,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from mjxgrad._arrays import instance
+from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -61,6 +63,9 @@ def frames(
         RenderingUnavailableError: if there is no OpenGL.
     """
     mj_model = scene.mj_model if isinstance(scene, Scene) else scene
+    instance("scene", mj_model, mujoco.MjModel, "of mg.load_scene, or a mujoco.MjModel")
+    if isinstance(qpos, Trajectory):
+        raise ValueError("qpos must be positions, got a trajectory: give its .qpos")
     if timestep is None:
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
     positions = np.asarray(qpos, dtype=np.float64)
@@ -95,6 +100,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
         fps: frames per second.
 
     Raises:
+        ValueError: if the video has no frames.
         OSError: if the file cannot be written.
         RuntimeError: if ffmpeg fails, or is not installed.
     """
@@ -106,6 +112,8 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
         raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
     path, video = Path(path), np.asarray(video)
+    if video.ndim != 4 or not len(video):
+        raise ValueError(f"video must have shape (frames, height, width, 3), got {video.shape}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path must be in an existing folder, got {path}")
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float, PyTree
 from mjxgrad._programs import is_traced
 from mjxgrad.rollouts import arguments, by_mjx, by_mujoco
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees
-from mjxgrad.rollouts.state import State, check_scene
+from mjxgrad.rollouts.state import State, check_start
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact, Discrete, Smoothing, smoothing_warnings
@@ -68,9 +68,7 @@ def rollout(
             is missing or contradicted, or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as
             diverged at this step).
     """
-    check_scene(scene)
-    if not isinstance(state, State):
-        raise ValueError(f"state must be of mg.initial_state, or the end of a rollout, got {type(state).__name__}")
+    check_start(scene, state)
     native = arguments.native_motion(scene, contact)
     for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)

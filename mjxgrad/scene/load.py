@@ -20,6 +20,7 @@ from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.contact.softness import check_softness
 from mjxgrad.scene.conversions import (
     AFTER_REFUSALS,
     BEFORE_REFUSALS,
@@ -76,8 +77,8 @@ def load_scene(
         SceneError: if MuJoCo cannot read the MJCF, or nothing in it can move. Where MJX is asked for, also if MJX cannot
             simulate it, with all unsupported features, or loading would take minutes by the number of geom pairs.
     """
-    if softness is not None and not isinstance(softness, Softness):
-        raise ValueError(f"softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got {softness!r}")
+    if softness is not None:
+        check_softness(softness)
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:

@@ -21,6 +21,7 @@ from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
+from mjxgrad.contact.softness import check_softness
 from mjxgrad.contact.warnings import contact_differences, contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.refusals import has_medium
@@ -83,6 +84,7 @@ class Scene(eqx.Module):
         Raises:
             ValueError: as `Softness.apply`.
         """
+        check_softness(softness)
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
         for message in softness_warnings(softness, scene.model) + scene.warnings():
             _warn(self, message)
