@@ -1,6 +1,8 @@
-"""Numbers and names as text, for messages and tables."""
+"""Numbers and names as text, for messages and tables; and files of text."""
 
+import os
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,3 +41,23 @@ def format_number(x: float) -> str:
     if 1e3 <= abs(x) < 99999.5:
         return f"{x:.0f}"
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+
+
+def write(path: str | Path, text: str) -> None:
+    """Write a file beside its place and rename it, so that a full disk leaves what was there.
+
+    Raises:
+        OSError: if the file cannot be written; the message names it.
+    """
+    path = Path(path)
+    is_file = path.is_file() or not path.exists()  # and not, say, /dev/stdout
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}") if is_file else path
+    try:
+        partial.write_text(text, encoding="utf-8")
+        if is_file:
+            partial.replace(path)
+    except OSError as error:
+        raise OSError(f"{path} could not be written: {error.strerror}") from error
+    finally:
+        if is_file:
+            partial.unlink(missing_ok=True)

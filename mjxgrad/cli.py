@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from mjxgrad._text import write
+
 try:
     import cyclopts
 except ImportError:
@@ -131,7 +133,7 @@ def check(
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)
     if html is not None:
-        html.write_text(verdict.as_html(), encoding="utf-8")
+        write(html, verdict.as_html())
         log(f"wrote {html}")
     return 1 if verdict.faults else 0
 
@@ -182,8 +184,8 @@ def sweep(
         horizon=horizon,
         contact=mg.stepping.own_motion(gradient, engine),
     )
-    print(found)
-    html.write_text(found.as_html(), encoding="utf-8")
+    print(found, flush=True)
+    write(html, found.as_html())
     log(f"wrote {html}")
 
 
@@ -242,7 +244,7 @@ def identify(
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")
     text = page.identified_page(Path(scene).name, loaded, result, fitted, judged)
-    (output / "report.html").write_text(text, encoding="utf-8")
+    write(output / "report.html", text)
     log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
     return 0 if result.is_sound else 1
 
@@ -279,7 +281,7 @@ def new(
         stddev=advice.stddev,
         video=str(output.with_suffix(".mp4")),
     )
-    output.write_text(text, encoding="utf-8")
+    write(output, text)
     print(f"wrote {output}: write your cost into it, then python {output}")
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")

@@ -6,6 +6,7 @@ import difflib
 import functools
 import os
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjxgrad._text import write
 from mjxgrad.identification import parameters
 from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import Parameter
@@ -91,8 +93,12 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     """
     columns = _read(Path(path))
     times = columns.pop("time", None)
-    if times is None or len(times) < 2 or not (np.diff(times) > 0).all():
-        raise ValueError(f"{path} must have a column named time, increasing (s), got {', '.join(columns) or 'nothing'}")
+    if times is None:
+        raise ValueError(f"{path} must have a column named time (s), got {', '.join(columns) or 'nothing'}")
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        late = 1 + int(np.argmin(np.diff(times, append=np.inf) > 0))
+        where = f"not after row {late}" if len(times) > 1 else f"{len(times)} rows"
+        raise ValueError(f"time in {path} must increase over two rows or more, got {where}")
     places, unknown = _places(scene.mj_model), []
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
@@ -123,17 +129,20 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a file by name."""
     if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            wholes = {name: np.asarray(arrays[name], float) for name in arrays}
+        try:
+            with np.load(path) as arrays:
+                wholes = {name: np.asarray(arrays[name], float) for name in arrays}
+        except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} must be an NPZ with arrays of numbers: {error}") from error
         wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
         found = {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
     else:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            names, *rows = [row for row in csv.reader(file) if row] or [[]]
         try:
+            with path.open(encoding="utf-8-sig", newline="") as file:
+                names, *rows = [row for row in csv.reader(file) if row] or [[]]
             table = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows]
             found = dict(zip((name.strip() for name in names), np.array(table, float).T, strict=True))
-        except ValueError as error:
+        except (ValueError, csv.Error) as error:
             raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
     if len({len(column) for column in found.values()}) > 1:
         raise ValueError(f"columns of {path} must be as long as time, got { ({n: len(c) for n, c in found.items()}) }")
@@ -219,4 +228,4 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     for folder in ("meshdir", "texturedir"):
         there = Path(source).parent / (getattr(spec, folder) or "")
         setattr(spec, folder, os.path.relpath(there, Path(path).parent))
-    Path(path).write_text(spec.to_xml(), encoding="utf-8")
+    write(path, spec.to_xml())

@@ -171,7 +171,7 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
         return found
 
     present = contact_parameters(scene.model, _touching(scene, named)).friction
-    return Parameter(np.clip(float(present[0, 0]), *bounds), *bounds, write=write)
+    return _positive(float(present[0, 0]), bounds, write, "", "friction")
 
 
 def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = None, **subset: Any) -> Parameter:
@@ -275,4 +275,6 @@ def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: 
         if not (nominal > 0).all():
             raise ValueError(f"bounds of {name} must be given where it is not positive, got {nominal.tolist()}")
         bounds = (nominal / _FACTOR, nominal * _FACTOR)
+    if name != "gear" and np.any(np.asarray(bounds[0]) < 0):
+        raise ValueError(f"bounds of {name} must not be negative, got {bounds[0]}")
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)
