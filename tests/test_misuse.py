@@ -330,6 +330,7 @@ FOUND = {
     "mg.check(balls, 3)": "cost must be a function or its name, got 3",
     "mg.check(balls, seed=-3)": "seed must be at least 0, got -3",
     "mg.sweep(balls.mj_model, seed=-3)": "seed must be at least 0, got -3",
+    "mg.sweep(balls.mj_model, noise=0.0)": "noise must be positive and finite, got 0.0",
     "mg.SceneTask(scene, state, 3, 2)": "a cost or policy must be a function, got 3",
     "identify(recordings=fit.Recording({'qpos': five}))": "recordings must hold at least one, in a list, got a recording",
     "identify(recordings=['a.csv'])": "recordings must be of mg.identification.Recording, got str",
