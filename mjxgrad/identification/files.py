@@ -95,10 +95,10 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     times = columns.pop("time", None)
     if times is None:
         raise ValueError(f"{path} must have a column named time (s), got {', '.join(columns) or 'nothing'}")
-    if len(times) < 2 or not (np.diff(times) > 0).all():
-        late = 1 + int(np.argmin(np.diff(times, append=np.inf) > 0))
-        where = f"not after row {late}" if len(times) > 1 else f"{len(times)} rows"
-        raise ValueError(f"time in {path} must increase over two rows or more, got {where}")
+    if len(times) < 2:
+        raise ValueError(f"{path} must have at least two rows of numbers, got {len(times)}")
+    if late := np.flatnonzero(~(np.diff(times) > 0)).tolist():
+        raise ValueError(f"time in {path} must increase, got {times[late[0]]:g}, then {times[late[0] + 1]:g}")
     places, unknown = _places(scene.mj_model), []
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
@@ -140,8 +140,11 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         try:
             with path.open(encoding="utf-8-sig", newline="") as file:
                 names, *rows = [row for row in csv.reader(file) if row] or [[]]
+            if wrong := [(line, len(row)) for line, row in enumerate(rows, 2) if len(row) != len(names)]:
+                raise ValueError("line {} has {} cells, not {}".format(*wrong[0], len(names)))
             table = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows]
-            found = dict(zip((name.strip() for name in names), np.array(table, float).T, strict=True))
+            numbers = np.array(table, float).reshape(len(rows), len(names))
+            found = dict(zip((name.strip() for name in names), numbers.T, strict=True))
         except (ValueError, csv.Error) as error:
             raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
     if len({len(column) for column in found.values()}) > 1:

@@ -65,7 +65,8 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
     ("columns", "said"),
     [
         ({"x": [1, 2]}, "must have a column named time"),
-        ({"time": [0, 1, 1], "place": [1, 2, 3]}, "must increase over two rows or more, got not after row 2"),
+        ({"time": [0, 1, 1], "place": [1, 2, 3]}, "time in .* must increase, got 1, then 1"),
+        ({"time": [], "place": []}, "must have at least two rows of numbers, got 0"),
         ({"time": [0, 1], "x": [1, 2]}, "must say what it is, as one of ctrl:x, qpos:x"),
         ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo"),
         ({"time": [0, 1], "ctrl:x": [0, 0], "servo": [0, 0], "palce": [1, 2]}, "did you mean place"),
@@ -78,10 +79,17 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
         files.recording(scene, tmp_path / "a.csv")
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.npz"])
-def test_a_file_of_other_bytes_is_named(scene, tmp_path, name):
-    (tmp_path / name).write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match=name):
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.csv", bytes(range(256)), "a.csv must be a line of names, then numbers"),
+        ("a.npz", bytes(range(256)), "a.npz must be an NPZ with arrays of numbers"),
+        ("a.csv", b"time,x\n0,1,2", "line 2 has 3 cells, not 2"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_named(scene, tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=said):
         files.recording(scene, tmp_path / name)
 
 
