@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
     The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
-    interruption.
+    interruption. Once it measures derivatives an interrupted `check` prints the verdict so far.
     """
     # SIGTERM is handled like Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
