@@ -43,21 +43,18 @@ def format_number(x: float) -> str:
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
 
 
-def write(path: str | Path, text: str) -> None:
+def write(path: str | Path, content: str | bytes) -> None:
     """Write a file beside its place and rename it, so that a full disk leaves what was there.
 
     Raises:
         OSError: if the file cannot be written; the message names it.
     """
     path = Path(path)
-    is_file = path.is_file() or not path.exists()  # and not, say, /dev/stdout
-    partial = path.with_name(f".{path.name}.partial-{os.getpid()}") if is_file else path
+    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     try:
-        partial.write_text(text, encoding="utf-8")
-        if is_file:
-            partial.replace(path)
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        partial.replace(path)
     except OSError as error:
         raise OSError(f"{path} could not be written: {error.strerror}") from error
     finally:
-        if is_file:
-            partial.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)

@@ -317,8 +317,8 @@ def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = 
         return
     folders = path.absolute().parents
     there = next(folder for folder in folders if folder.exists()) if makes_folder else folders[0]
-    if path.is_dir():
-        raise CommandError(f"{path} cannot be written: it is a folder")
+    if path.exists() and not path.is_file():
+        raise CommandError(f"{path} cannot be written: it is not a file")
     if not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be an existing folder that can be written to")
     if is_page:

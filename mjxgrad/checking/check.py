@@ -21,7 +21,7 @@ from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
-from mjxgrad.objective.task import checked_cost
+from mjxgrad.objective.task import as_pytree, checked_cost
 from mjxgrad.report import Block, page
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 
@@ -131,8 +131,6 @@ def check(
         ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
         SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
-    if cost is not None and not callable(cost) and not isinstance(cost, str):
-        raise ValueError(f"cost must be a function or its name, got {cost!r}")
     if not budget > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
     say = log or (lambda _: None)
@@ -140,14 +138,14 @@ def check(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene = source if isinstance(source, Scene) else load_scene(source)
-        cost = named_cost(scene, cost) if isinstance(cost, str) else cost
+        outcome = named_cost(scene, cost) if isinstance(cost, str) else as_pytree(cost)
         started = time.perf_counter()
         motions = random_motions(scene, rng)
         stability = check_stability(scene, speed=motions.touch_speed or None)
     found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
-    names, outcomes = _outcomes(scene, cost, rng)
+    names, outcomes = _outcomes(scene, outcome, rng)
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")

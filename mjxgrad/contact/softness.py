@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import as_float, instance, is_known
+from mjxgrad._arrays import as_float, is_known
 from mjxgrad._mjx import mjx
 from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.contact.law import compensated_stiffness
@@ -257,8 +257,3 @@ def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part
                     f"{part} must be given, or be the same now in the pairs {selected[j]} and "
                     f"{pair}, which share a geom, got {known[j]:.4g} and {known[i]:.4g}; {remedy}"
                 )
-
-
-def check_softness(softness: Any) -> None:
-    """Refuse an argument that is no softness."""
-    instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")

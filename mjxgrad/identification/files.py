@@ -128,28 +128,32 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a file by name."""
-    if path.suffix == ".npz":
-        try:
-            with np.load(path) as arrays:
-                wholes = {name: np.asarray(arrays[name], float) for name in arrays}
-        except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} must be an NPZ with arrays of numbers: {error}") from error
-        wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
-        found = {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
-    else:
-        try:
-            with path.open(encoding="utf-8-sig", newline="") as file:
-                names, *rows = [row for row in csv.reader(file) if row] or [[]]
-            if wrong := [(line, len(row)) for line, row in enumerate(rows, 2) if len(row) != len(names)]:
-                raise ValueError("line {} has {} cells, not {}".format(*wrong[0], len(names)))
-            table = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows]
-            numbers = np.array(table, float).reshape(len(rows), len(names))
-            found = dict(zip((name.strip() for name in names), numbers.T, strict=True))
-        except (ValueError, csv.Error) as error:
-            raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
+    is_npz = path.suffix == ".npz"
+    try:
+        found = _read_npz(path) if is_npz else _read_csv(path)
+    except (ValueError, TypeError, AttributeError, EOFError, csv.Error, zipfile.BadZipFile) as error:
+        form = "an NPZ with arrays of numbers" if is_npz else "a line of names, then numbers separated by commas"
+        raise ValueError(f"{path} must be {form}: {error}") from error
     if len({len(column) for column in found.values()}) > 1:
         raise ValueError(f"columns of {path} must be as long as time, got { ({n: len(c) for n, c in found.items()}) }")
     return found
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as arrays:
+        wholes = {name: np.asarray(arrays[name], float) for name in arrays}
+    wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
+    return {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        names, *rows = [row for row in csv.reader(file) if row] or [[]]
+    for line, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")
+    numbers = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
+    return dict(zip(map(str.strip, names), numbers.reshape(len(rows), len(names)).T, strict=True))
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import instance
+from mjxgrad._arrays import instance, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
@@ -94,8 +94,7 @@ def identify(
         instance("recordings", part, Recording, "of mg.identification.Recording")
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
-    if max_steps < 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    max_steps = whole("max_steps", max_steps)
     try:  # before anything is compiled
         importlib.import_module("optimistix")
     except ImportError as error:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from mjxgrad._arrays import whole
 from mjxgrad.batched.device import is_gpu
 from mjxgrad.estimators.rules import Consistent, Rule
 
@@ -53,8 +54,7 @@ class Settings:
 
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+            whole(name, getattr(self, name))
         for name in ("discount", "trace"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from mjxgrad._arrays import instance
+from mjxgrad._text import write
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
 
@@ -119,14 +120,8 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     # Compressed to memory: a full disk then raises Python's own OSError, not a page of ffmpeg's output.
     even = video[:, : video.shape[1] // 2 * 2, : video.shape[2] // 2 * 2]
-    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     # The index at the front lets a browser start before all is read.
-    content = mediapy.compress_video(even, codec="h264", fps=fps, crf=23, ffmpeg_args="-movflags +faststart")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write(path, mediapy.compress_video(even, codec="h264", fps=fps, crf=23, ffmpeg_args="-movflags +faststart"))
 
 
 def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) -> None:

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjxgrad._arrays import instance
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad._warnings import collected
 from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.contact.softness import check_softness
 from mjxgrad.scene.conversions import (
     AFTER_REFUSALS,
     BEFORE_REFUSALS,
@@ -78,7 +78,7 @@ def load_scene(
             simulate it, with all unsupported features, or loading would take minutes by the number of geom pairs.
     """
     if softness is not None:
-        check_softness(softness)
+        instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:

@@ -14,14 +14,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import is_known
+from mjxgrad._arrays import instance, is_known
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
-from mjxgrad.contact.softness import check_softness
 from mjxgrad.contact.warnings import contact_differences, contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.refusals import has_medium
@@ -84,7 +83,7 @@ class Scene(eqx.Module):
         Raises:
             ValueError: as `Softness.apply`.
         """
-        check_softness(softness)
+        instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
         for message in softness_warnings(softness, scene.model) + scene.warnings():
             _warn(self, message)

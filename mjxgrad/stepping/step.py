@@ -10,7 +10,6 @@ Matrix products request full precision: NVIDIA GPUs otherwise round factors to t
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +70,12 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
             a leading axis, or asks for C MuJoCo.
         NotImplementedError: if MJX lacks the integrator.
     """
-    _check(model, data, contact)
+    check_contact(contact, is_step=True)
+    if not (hasattr(model, "opt") and hasattr(data, "ctrl")):
+        given = f"{type(model).__name__} and {type(data).__name__}"
+        raise ValueError(
+            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
+        )
     if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
         kind = model.opt.integrator
         raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
@@ -103,18 +107,9 @@ def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) 
     Raises:
         ValueError: as `step`.
     """
-    _check(model, data, contact)
+    check_contact(contact, is_step=True)
     with _at_full_precision(model, data):
         return _forward(model, data, contact)
-
-
-def _check(model: Any, data: Any, contact: Contact) -> None:
-    if not (hasattr(model, "opt") and hasattr(data, "ctrl")):
-        given = f"{type(model).__name__} and {type(data).__name__}"
-        raise ValueError(
-            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
-        )
-    check_contact(contact, is_step=True)
 
 
 def _forward(
