@@ -256,7 +256,7 @@ FOUND = {
     "planned(schedule=np.zeros(0))": "schedule must be one factor per iteration",
     "planned(schedule=np.array([1.0, 0.0]))": "schedule must be positive, got 0: for no smoothing take Exact()",
     "planned(lower=1.0, upper=0.0)": "lower must be at most upper",
-    "planned(controls=np.zeros((3, 1)))": "controls must have shape (horizon, 2)",
+    "planned(controls=np.zeros((3, 1)))": "controls must have shape (3, 2)",
     "sampled(stddev_state=-1.0)": "stddev_state must be at least 0",
     "sampled(stddev_control=jnp.ones(3))": "stddev_control must be a number or have shape",
     "sampled(num_samples=4)": "num_samples must be at least 6",
@@ -298,7 +298,7 @@ FOUND = {
     # Arguments of another kind, or in another place.
     "scene.with_softness(1e4)": "softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got float",
     "mg.linearise(scene, scene.data)": "state must be of mg.initial_state, or the end of a rollout, got Data",
-    "mg.linearise(scene, state, jnp.zeros(3))": "ctrl must have shape (1,), one number per actuator, got (3,)",
+    "mg.linearise(scene, state, jnp.zeros(3))": "controls must have shape (1, 1), one row per step",
     "mg.step(scene, state)": "a step takes MJX's model and data, as scene.model and scene.data, got Scene and State",
     "mg.check_stability(scene.model)": "scene must be of mg.load_scene, got Model",
     "mg.check(balls, lambda trajectory: trajectory.qpos)": "a scalar of shape () or one number per state, shape (",

@@ -13,6 +13,7 @@ from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
+from mjxgrad.rollouts.arguments import sequence_of
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]
@@ -201,13 +202,9 @@ def optimise_trajectory(
     lower, upper = system.limits(lower, upper, start.dtype)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
-    if controls.shape[1] != system.num_controls or not len(controls):
-        wanted = f"(horizon, {system.num_controls}) with a horizon of at least 1"
-        raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
+    sequence_of(controls, None, None, system.num_controls)
     if factors.ndim != 1 or not factors.size:
         raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
-    if (values := known(controls)) is not None and not np.isfinite(values).all():
-        raise ValueError("controls must be finite, got some that are not")
     given, low, high = known(factors), known(lower), known(upper)
     if given is not None and not (given > 0).all():
         raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")

@@ -7,8 +7,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native import linearise as by_mujoco
-from mjxgrad.rollouts.arguments import arguments_of, check_shapes, native_motion
-from mjxgrad.rollouts.state import State, check_start, data_of
+from mjxgrad.rollouts.arguments import arguments_of, check_start, native_motion, sequence_of
+from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Slope, step
 
@@ -47,10 +47,8 @@ def linearise(
         ValueError: as `rollout`.
     """
     check_start(scene, state)
-    check_shapes(scene, state)
     ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
-    if ctrl.shape != (scene.model.nu,):
-        raise ValueError(f"ctrl must have shape ({scene.model.nu},), one number per actuator, got {ctrl.shape}")
+    sequence_of(ctrl[None], None, 1, scene.model.nu)
     native = native_motion(scene, contact)
     if native is not None:
         start, resting = arguments_of(scene, state)

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float, PyTree
 from mjxgrad._programs import is_traced
 from mjxgrad.rollouts import arguments, by_mjx, by_mujoco
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees
-from mjxgrad.rollouts.state import State, check_start
+from mjxgrad.rollouts.state import State
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact, Discrete, Smoothing, smoothing_warnings
@@ -68,7 +68,7 @@ def rollout(
             is missing or contradicted, or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as
             diverged at this step).
     """
-    check_start(scene, state)
+    arguments.check_start(scene, state)
     native = arguments.native_motion(scene, contact)
     for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
@@ -76,7 +76,6 @@ def rollout(
         raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
     policy = controls if callable(controls) else None
     sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
-    arguments.check_shapes(scene, state)
     forces = arguments.applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     if native is not None:

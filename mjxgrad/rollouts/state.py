@@ -151,9 +151,3 @@ def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
 def check_scene(scene: Any) -> None:
     """Refuse an argument that is no scene."""
     instance("scene", scene, Scene, "of mg.load_scene")
-
-
-def check_start(scene: Any, state: Any) -> None:
-    """Refuse arguments that are no scene and no state."""
-    check_scene(scene)
-    instance("state", state, State, "of mg.initial_state, or the end of a rollout")
