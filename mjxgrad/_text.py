@@ -11,8 +11,10 @@ import numpy as np
 class Printed:
     """Something that a notebook shows as `print` does, and not as all its arrays."""
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        printer.text(str(self))
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        # IPython asks class by class: the `__repr__` of a dataclass would come before a base class's method.
+        cls._repr_pretty_ = lambda self, printer, cycle: printer.text(str(self))
 
 
 def name_pairs(pairs: Sequence[object]) -> str:
