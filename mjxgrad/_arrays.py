@@ -46,6 +46,12 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
     return number
 
 
+def instance(name: str, value: Any, kind: type, wanted: str) -> None:
+    """Refuse a value of another type."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
+
+
 def form(value: Any) -> str:
     """Return the shape of numbers, or the type of anything else, for messages."""
     return f"shape {jnp.shape(value)}" if eqx.is_array_like(value) else type(value).__name__

@@ -1,6 +1,8 @@
-"""Numbers and names as text, for messages and tables."""
+"""Numbers and names as text, for messages and tables; and files of text."""
 
+import os
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,8 +11,10 @@ import numpy as np
 class Printed:
     """Something that a notebook shows as `print` does, and not as all its arrays."""
 
-    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        printer.text(str(self))
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        # IPython asks class by class: the `__repr__` of a dataclass would come before a base class's method.
+        cls._repr_pretty_ = lambda self, printer, cycle: printer.text(str(self))
 
 
 def name_pairs(pairs: Sequence[object]) -> str:
@@ -39,3 +43,20 @@ def format_number(x: float) -> str:
     if 1e3 <= abs(x) < 99999.5:
         return f"{x:.0f}"
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+
+
+def write(path: str | Path, content: str | bytes) -> None:
+    """Write a file beside its place and rename it, so that a full disk leaves what was there.
+
+    Raises:
+        OSError: if the file cannot be written; the message names it.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    try:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        partial.replace(path)
+    except OSError as error:
+        raise OSError(f"{path} could not be written: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from mjxgrad._text import write
+
 try:
     import cyclopts
 except ImportError:
@@ -76,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
     The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
-    interruption.
+    interruption. Once it measures derivatives an interrupted `check` prints the verdict so far.
     """
     # SIGTERM is handled like Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -131,7 +133,7 @@ def check(
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)
     if html is not None:
-        html.write_text(verdict.as_html(), encoding="utf-8")
+        write(html, verdict.as_html())
         log(f"wrote {html}")
     return 1 if verdict.faults else 0
 
@@ -182,8 +184,8 @@ def sweep(
         horizon=horizon,
         contact=mg.stepping.own_motion(gradient, engine),
     )
-    print(found)
-    html.write_text(found.as_html(), encoding="utf-8")
+    print(found, flush=True)
+    write(html, found.as_html())
     log(f"wrote {html}")
 
 
@@ -242,7 +244,7 @@ def identify(
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")
     text = page.identified_page(Path(scene).name, loaded, result, fitted, judged)
-    (output / "report.html").write_text(text, encoding="utf-8")
+    write(output / "report.html", text)
     log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
     return 0 if result.is_sound else 1
 
@@ -279,7 +281,7 @@ def new(
         stddev=advice.stddev,
         video=str(output.with_suffix(".mp4")),
     )
-    output.write_text(text, encoding="utf-8")
+    write(output, text)
     print(f"wrote {output}: write your cost into it, then python {output}")
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")
@@ -315,7 +317,9 @@ def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = 
         return
     folders = path.absolute().parents
     there = next(folder for folder in folders if folder.exists()) if makes_folder else folders[0]
-    if path.is_dir() or not there.is_dir() or not os.access(there, os.W_OK):
+    if path.exists() and not path.is_file():
+        raise CommandError(f"{path} cannot be written: it is not a file")
+    if not there.is_dir() or not os.access(there, os.W_OK):
         raise CommandError(f"{path} cannot be written: {there} must be an existing folder that can be written to")
     if is_page:
         importlib.import_module("mjxgrad.report").require()

@@ -59,6 +59,20 @@ def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said)
     assert said in line
 
 
+def test_a_full_disk_costs_neither_the_answer_nor_what_was_there(scene, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    Path("page.html").write_text("before")
+    monkeypatch.setattr(Path, "replace", full)
+    assert cli.main(["check", scene, "--quick", "--html", "page.html"]) == 2
+    said = capsys.readouterr()
+    assert said.out.startswith("scene.xml: Differentiate it")
+    assert "page.html could not be written: No space left on device" in said.err
+    assert sorted(path.name for path in Path().iterdir()) == ["page.html", "scene.xml"]
+    assert Path("page.html").read_text() == "before"
+
+
 def test_an_interruption_ends_in_one_line(scene, capsys, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt

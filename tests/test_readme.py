@@ -1,5 +1,6 @@
 """The examples of the README and of the library's own page run as printed."""
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -43,6 +44,25 @@ def _pushes_the_ball_to_its_place(names):
     assert abs(names["plan"].states[-1, 1] - 0.2) < 0.05
 
 
+def _holds_and_learns(names):
+    """Knocked to more than 0.05 rad, the pole stands again; the network's cost falls by half and more."""
+    tilt = np.abs(names["knocked"].qpos[:, 1])
+    assert tilt.max() > 0.05
+    assert tilt[-1] < 0.01
+    assert names["costs"][-1] < 0.5 * names["costs"][0]
+
+
+def _descends_by_pytorch(names):
+    """The throw begins 0.19 m short. The slope along it is the difference over 10 cm/s, within 2 %."""
+    torch, apply = names["torch"], names["Miss"].apply
+    assert names["loss"] < 1e-3
+    start = torch.tensor([1.0, 0.0, -1.0], requires_grad=True)
+    apply(start).backward()
+    step = torch.tensor([0.05, 0.0, 0.0])
+    slope = (apply(start.detach() + step) - apply(start.detach() - step)) / 0.1
+    np.testing.assert_allclose(start.grad[0], slope, rtol=0.02)
+
+
 def _rises(names):
     assert np.isfinite(names["result"].history.cost).all()
     assert isinstance(names["result"].params, type(names["network"]))
@@ -67,6 +87,8 @@ _CHECKS = (
     _finds_the_parameters,
     _stands,
     _pushes_the_ball_to_its_place,
+    _holds_and_learns,
+    _descends_by_pytorch,
     _rises,
     _falls_and_swings,
     _tells_which_gradient_holds,
@@ -76,11 +98,32 @@ _CHECKS = (
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(len(_CHECKS)), ids=[check.__name__[1:] for check in _CHECKS])
 def test_how_tos_run_and_do_their_job(number, tmp_path, monkeypatch):
+    if _CHECKS[number] is _descends_by_pytorch:
+        pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     names = {}
     with jax.enable_x64(False):
         exec(compile(_examples("mjxgrad/HOWTO.md")[number], "HOWTO.md", "exec"), names)
     _CHECKS[number](names)
+
+
+_SHOWN = ("mg.check(scene, derivatives=False)", "result", "learned", "plan", "", "", "result", "", "found.result")
+
+
+@pytest.mark.slow
+def test_the_how_tos_run_as_a_notebook_whose_cells_show_what_print_shows(tmp_path):
+    """In one kernel. A cell that ends in an object shows lines of text, and not its arrays."""
+    notebook, run, _ = map(pytest.importorskip, ("nbformat.v4", "nbclient", "ipykernel"))
+    cells = []
+    for code, last in zip(_examples("mjxgrad/HOWTO.md"), _SHOWN, strict=True):
+        if "import torch" not in code or importlib.util.find_spec("torch"):
+            cells += map(notebook.new_code_cell, (code, f"print({last})\n{last}"))
+    run.execute(notebook.new_notebook(cells=cells), cwd=tmp_path, timeout=600)
+    for outputs in (cell.outputs for cell in cells[1::2]):
+        printed = "".join(output.text for output in outputs if output.get("name") == "stdout").strip()
+        shown = [output.data["text/plain"] for output in outputs if output.output_type == "execute_result"]
+        assert shown == ([printed] if printed else [])
+        assert "f32[" not in printed
 
 
 def test_every_how_to_is_checked():

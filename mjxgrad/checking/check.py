@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjxgrad._arrays import whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
@@ -20,6 +21,7 @@ from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
+from mjxgrad.objective.task import as_pytree, checked_cost
 from mjxgrad.report import Block, page
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 
@@ -132,18 +134,18 @@ def check(
     if not budget > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
     say = log or (lambda _: None)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(whole("seed", seed, 0))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene = source if isinstance(source, Scene) else load_scene(source)
-        cost = named_cost(scene, cost) if isinstance(cost, str) else cost
+        outcome = named_cost(scene, cost) if isinstance(cost, str) else as_pytree(cost)
         started = time.perf_counter()
         motions = random_motions(scene, rng)
         stability = check_stability(scene, speed=motions.touch_speed or None)
     found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
-    names, outcomes = _outcomes(scene, cost, rng)
+    names, outcomes = _outcomes(scene, outcome, rng)
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
@@ -198,7 +200,7 @@ def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
 def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tuple[tuple[str, ...], Outcomes]:
     """Return the function from a trajectory to its outcomes, and their names."""
     if cost is not None:
-        return ("the cost",), lambda trajectory: jnp.asarray(cost(trajectory)).sum()[None]
+        return ("the cost",), lambda trajectory: checked_cost(cost(trajectory), len(trajectory.ctrl)).sum()[None]
     model = scene.mj_model
     trees = np.unique(model.body_rootid[model.jnt_bodyid])
     heaviest = sorted(trees.tolist(), key=lambda root: -model.body_subtreemass[root])[:_MOST_TREES]

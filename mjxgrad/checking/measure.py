@@ -159,6 +159,10 @@ def measure(
             found.append(task())
         except TimeoutError:
             left_out.append(words)
+        except KeyboardInterrupt:
+            log("interrupted: the verdict is of what was measured")
+            left_out.append(words)
+            end = 0.0
     return Measured(
         np.array(lengths) * motions.timestep,
         tuple(one for one in found if isinstance(one, Line)),

@@ -13,7 +13,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
-from mjxgrad._arrays import is_known
+from mjxgrad._arrays import is_known, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
@@ -209,10 +209,13 @@ def sweep(
         **task_settings: start, horizon and contact of `scene_task`.
 
     Raises:
-        ValueError: as `scene_task` and `bias_variance`, or if a stiffness is not positive.
+        ValueError: as `scene_task` and `bias_variance`, or if a stiffness or the noise is not positive.
     """
     if not all(0 < k < np.inf for k in stiffness):
         raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, stiffness))}")
+    if not 0 < noise < np.inf:
+        raise ValueError(f"noise must be positive and finite, got {noise}")
+    whole("seed", seed, 0)
     scene = load_scene(source)
     task = scene_task(scene, cost, seed=seed, **task_settings)
     knob = Knob(task, noise, seed)

@@ -24,6 +24,7 @@ from mjxgrad._text import Printed, aligned, format_number, format_range, name_pa
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
+from mjxgrad.rollouts.state import check_scene
 from mjxgrad.scene import Scene
 
 _LEAST_FRICTION = 0.01  # of pyramids in single precision
@@ -285,6 +286,7 @@ def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityRep
     Raises:
         ValueError: if the speed is not positive, or the scene is batched or traced.
     """
+    check_scene(scene)
     if speed is not None and not (math.isfinite(speed) and speed > 0):
         raise ValueError(f"speed must be positive, got {speed}; leave it out to skip these checks")
     model = scene.model

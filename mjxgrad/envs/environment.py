@@ -77,8 +77,7 @@ class Environment(InScene):
 
     def __check_init__(self):
         for name in ("frame_skip", "episode_length"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+            whole(name, getattr(self, name))
 
     @abstractmethod
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:

@@ -6,6 +6,7 @@ import difflib
 import functools
 import os
 import re
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjxgrad._text import write
 from mjxgrad.identification import parameters
 from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import Parameter
@@ -91,8 +93,12 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     """
     columns = _read(Path(path))
     times = columns.pop("time", None)
-    if times is None or len(times) < 2 or not (np.diff(times) > 0).all():
-        raise ValueError(f"{path} must have a column named time, increasing (s), got {', '.join(columns) or 'nothing'}")
+    if times is None:
+        raise ValueError(f"{path} must have a column named time (s), got {', '.join(columns) or 'nothing'}")
+    if len(times) < 2:
+        raise ValueError(f"{path} must have at least two rows of numbers, got {len(times)}")
+    if late := np.flatnonzero(~(np.diff(times) > 0)).tolist():
+        raise ValueError(f"time in {path} must increase, got {times[late[0]]:g}, then {times[late[0] + 1]:g}")
     places, unknown = _places(scene.mj_model), []
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
@@ -122,22 +128,32 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a file by name."""
-    if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            wholes = {name: np.asarray(arrays[name], float) for name in arrays}
-        wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
-        found = {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
-    else:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            names, *rows = [row for row in csv.reader(file) if row] or [[]]
-        try:
-            table = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows]
-            found = dict(zip((name.strip() for name in names), np.array(table, float).T, strict=True))
-        except ValueError as error:
-            raise ValueError(f"{path} must be a line of names, then numbers separated by commas: {error}") from error
+    is_npz = path.suffix == ".npz"
+    try:
+        found = _read_npz(path) if is_npz else _read_csv(path)
+    except (ValueError, TypeError, AttributeError, EOFError, csv.Error, zipfile.BadZipFile) as error:
+        form = "an NPZ with arrays of numbers" if is_npz else "a line of names, then numbers separated by commas"
+        raise ValueError(f"{path} must be {form}: {error}") from error
     if len({len(column) for column in found.values()}) > 1:
         raise ValueError(f"columns of {path} must be as long as time, got { ({n: len(c) for n, c in found.items()}) }")
     return found
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as arrays:
+        wholes = {name: np.asarray(arrays[name], float) for name in arrays}
+    wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
+    return {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        names, *rows = [row for row in csv.reader(file) if row] or [[]]
+    for line, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")
+    numbers = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
+    return dict(zip(map(str.strip, names), numbers.reshape(len(rows), len(names)).T, strict=True))
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
@@ -219,4 +235,4 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     for folder in ("meshdir", "texturedir"):
         there = Path(source).parent / (getattr(spec, folder) or "")
         setattr(spec, folder, os.path.relpath(there, Path(path).parent))
-    Path(path).write_text(spec.to_xml(), encoding="utf-8")
+    write(path, spec.to_xml())

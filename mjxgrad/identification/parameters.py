@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness
-from mjxgrad.contact.parameters import contact_parameters, deciding_geoms
+from mjxgrad.contact.parameters import ContactPair, contact_parameters, deciding_geoms
 from mjxgrad.scene import Scene
 from mjxgrad.stepping.rows import index_of
 
@@ -170,8 +170,8 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
             found["geom_friction"] = model.geom_friction.at[geoms, 0].set(value)
         return found
 
-    present = contact_parameters(scene.model, named.selected(scene.model)).friction
-    return Parameter(np.clip(float(present[0, 0]), *bounds), *bounds, write=write)
+    present = contact_parameters(scene.model, _touching(scene, named)).friction
+    return _positive(float(present[0, 0]), bounds, write, "", "friction")
 
 
 def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = None, **subset: Any) -> Parameter:
@@ -195,8 +195,14 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
         fields = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
         return {name: new for name in fields if (new := getattr(after, name)) is not getattr(model, name)}
 
-    present = contact_parameters(scene.model, Softness(**subset).selected(scene.model))
+    present = contact_parameters(scene.model, _touching(scene, Softness(**subset)))
     return _positive(float(getattr(present, part)[0]), bounds, write, units[part], part)
+
+
+def _touching(scene: Scene, named: Softness) -> tuple[ContactPair, ...]:
+    if found := named.selected(scene.model):
+        return found
+    raise ValueError(f"friction and softness need geoms that can touch, got none in {scene.name}")
 
 
 def damping(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
@@ -269,4 +275,6 @@ def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: 
         if not (nominal > 0).all():
             raise ValueError(f"bounds of {name} must be given where it is not positive, got {nominal.tolist()}")
         bounds = (nominal / _FACTOR, nominal * _FACTOR)
+    if name != "gear" and np.any(np.asarray(bounds[0]) < 0):
+        raise ValueError(f"bounds of {name} must not be negative, got {bounds[0]}")
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)

@@ -22,7 +22,7 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from mjxgrad._text import Printed, aligned, format_number
+from mjxgrad._text import Printed, aligned, format_number, write
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
@@ -182,7 +182,7 @@ class Identification(Printed):
             parts = {"nominal": self.start[name], "min_value": lower[name], "max_value": upper[name], "value": value}
             lines += [f"{name}:", f"  name: {name}", "  frozen: false"]
             lines += [f"  {key}: [{', '.join(map(_yaml, np.ravel(x).tolist()))}]" for key, x in parts.items()]
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write(path, "\n".join(lines) + "\n")
 
 
 def statistics(

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from mjxgrad._arrays import instance, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
@@ -82,12 +83,18 @@ def identify(
         DivergedError: if the simulation diverges with the nominal values.
         ImportError: if optimistix is not installed.
     """
-    if not recordings:
-        raise ValueError("recordings must hold at least one, got none")
+    if isinstance(recordings, Recording) or not recordings:
+        raise ValueError(
+            f"recordings must hold at least one, in a list, got {(recordings and 'a recording') or 'none'}"
+        )
+    instance("parameters", parameters, Mapping, "a dict from names to parameters")
+    for part in parameters.values():
+        instance("parameters", part, Parameter, "of mg.identification, such as mass(scene, 'torso')")
+    for part in recordings:
+        instance("recordings", part, Recording, "of mg.identification.Recording")
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
-    if max_steps < 1:
-        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
+    max_steps = whole("max_steps", max_steps)
     try:  # before anything is compiled
         importlib.import_module("optimistix")
     except ImportError as error:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from mjxgrad._arrays import whole
 from mjxgrad._programs import compile_once
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.stepping import Discrete, Engine
@@ -51,8 +52,7 @@ def evaluate(
     Raises:
         ValueError: if there are no episodes, or no such engine.
     """
-    if num_episodes < 1:
-        raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
+    num_episodes = whole("num_episodes", num_episodes)
     judge = environment if engine == "mjx" else environment.with_contact(Discrete(engine))
 
     def one(key: PRNGKeyArray) -> Evaluation:

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
+from mjxgrad._arrays import instance, whole
 from mjxgrad._text import Printed, format_range
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import ActorCritic, Learner, Policy
@@ -98,9 +99,9 @@ def learn(
         ValueError: if a number is below 1, environments differ in more than numbers, or the checkpoint is from another run.
     """
     settings = Settings() if settings is None else settings
-    for name, number in (("num_updates", num_updates), ("log_every", log_every)):
-        if number < 1:
-            raise ValueError(f"{name} must be at least 1, got {number}")
+    instance("settings", settings, Settings, "of mg.learning.Settings")
+    instance("key", key, jax.Array, "of jax.random.key")
+    num_updates, log_every = whole("num_updates", num_updates), whole("log_every", log_every)
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.wrap_key_data(key)
     environments = [environment] if not isinstance(environment, Sequence) else list(environment)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from mjxgrad._arrays import whole
 from mjxgrad.batched.device import is_gpu
 
 
@@ -52,11 +53,8 @@ class Settings:
 
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("discount", "trace", "alpha"):
-            if name == "alpha" and self.alpha is None:
-                continue
+            whole(name, getattr(self, name))
+        for name in ("discount", "trace", *(["alpha"] if self.alpha is not None else [])):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
         if self.trace < 1 and not self.has_critic:

@@ -54,9 +54,6 @@ class RunOptions(eqx.Module):
     def __check_init__(self):
         for name in ("num_steps", "evaluate_every", "patience"):
             whole(name, getattr(self, name))
-        if self.checkpoint is not None and not self.checkpoint.parent.is_dir():
-            folder = self.checkpoint.parent
-            raise ValueError(f"checkpoint must be in a folder that exists, got {self.checkpoint}; make {folder} first")
 
 
 class Carry(eqx.Module):

@@ -124,8 +124,12 @@ def run(
         on_all_devices: whether all devices of all processes get the arrays, for a method that spreads its work over them.
 
     Raises:
-        ValueError: if the checkpoint is damaged, or from a run with another program, other arrays or another start.
+        ValueError: if the checkpoint has no folder, is damaged, or from a run with another program, arrays or start.
     """
+    if checkpoint is not None and not checkpoint.parent.is_dir():
+        raise ValueError(
+            f"checkpoint must be in a folder that exists, got {checkpoint}; make {checkpoint.parent} first"
+        )
     arrays, static = eqx.partition(method, eqx.is_array)
     # A list, since the structure holds functions: runs of one program then have arguments of equal structure.
     numbers, structure = jax.tree.flatten(arrays)

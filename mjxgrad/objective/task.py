@@ -72,6 +72,8 @@ class Task(eqx.Module):
 
 def as_pytree(function: Any) -> Any:
     """Return a function as a pytree, so that a module that holds it can pass through jit and vmap; None stays None."""
+    if function is not None and not callable(function):
+        raise ValueError(f"a cost or policy must be a function, got {function!r:.80}")
     is_one = function is None or isinstance(function, eqx.Module | jax.tree_util.Partial)
     return function if is_one else jax.tree_util.Partial(function)
 
@@ -161,14 +163,16 @@ class SceneTask(Task, InScene):
             qpos, qvel, act = (x[:-1] for x in (trajectory.qpos, trajectory.qvel, jnp.asarray(trajectory.act)))
             time = start.time + self.scene.model.opt.timestep * jnp.arange(self.horizon)
             states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
-        cost = self.cost(trajectory)
-        if not eqx.is_array_like(cost) or jnp.shape(cost) not in ((), (self.horizon + 1,)):
-            raise ValueError(
-                "the task's cost must return a scalar of shape () or one number per state, "
-                f"shape ({self.horizon + 1},), got {form(cost)}"
-            )
-        charged = finite_cost(jnp.asarray(cost), trajectory)
+        charged = finite_cost(checked_cost(self.cost(trajectory), self.horizon), trajectory)
         return Outcome(charged.sum(), states, charged if charged.ndim else None)
+
+
+def checked_cost(cost: Any, horizon: int) -> Float[Array, "*steps"]:
+    """Return a cost; refuse all but a number and one number per state."""
+    if not eqx.is_array_like(cost) or jnp.shape(cost) not in ((), (horizon + 1,)):
+        wanted = f"a scalar of shape () or one number per state, shape ({horizon + 1},)"
+        raise ValueError(f"the task's cost must return {wanted}, got {form(cost)}")
+    return jnp.asarray(cost)
 
 
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:

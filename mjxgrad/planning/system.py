@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import whole
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
-from mjxgrad.rollouts.state import data_of, state_of
+from mjxgrad.rollouts.state import check_scene, data_of, state_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete, check_contact, step
 
@@ -108,8 +109,8 @@ class SceneSystem(System):
     contact: Contact = Discrete()
 
     def __check_init__(self):
-        if self.num_substeps < 1:
-            raise ValueError(f"num_substeps must be at least 1, got {self.num_substeps}")
+        check_scene(self.scene)
+        whole("num_substeps", self.num_substeps)
 
     @property
     def num_changes(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -196,11 +197,17 @@ class GoalCost(Cost):
     control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
-        distance = system.difference(state, self.goal)
-        return 0.5 * (jnp.sum(self.stage_weight * distance**2) + jnp.sum(self.control_weight * control**2))
+        away = self._weighted("stage_weight", system.difference(state, self.goal))
+        return 0.5 * (away + self._weighted("control_weight", control))
 
     def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
-        return 0.5 * jnp.sum(self.terminal_weight * system.difference(state, self.goal) ** 2)
+        return 0.5 * self._weighted("terminal_weight", system.difference(state, self.goal))
+
+    def _weighted(self, name: str, change: Float[Array, " size"]) -> Float[Array, ""]:
+        weight = getattr(self, name)
+        if weight.shape not in ((), change.shape):
+            raise ValueError(f"{name} must be one number or have shape {change.shape}, got {weight.shape}")
+        return jnp.sum(weight * change**2)
 
 
 class Quadratic(eqx.Module):

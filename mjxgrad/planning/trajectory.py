@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
-from mjxgrad._arrays import known
-from mjxgrad._programs import compiled
+from mjxgrad._arrays import instance, known, one_key
+from mjxgrad._programs import compiled, is_traced
+from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
+from mjxgrad.rollouts.arguments import sequence_of
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]
@@ -47,7 +49,7 @@ class Iterations(eqx.Module):
     promised: _Row
 
 
-class Plan(eqx.Module):
+class Plan(eqx.Module, Printed):
     """The controls of least cost that were found; under `jax.vmap` every field gains leading axes.
 
     Attributes:
@@ -81,6 +83,12 @@ class Plan(eqx.Module):
         if self.diverged:
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
         return "converged" if self.converged else "not converged; take more iterations"
+
+    def __str__(self) -> str:
+        if is_traced(self.cost) or self.cost.ndim:
+            return repr(self)
+        cost, before = (format_number(float(x)) for x in (self.cost, self.start_cost))
+        return f"Cost {cost} from {before} in {self.iterations.cost.size} iterations: {self.verdict()}."
 
 
 class Feedback(eqx.Module):
@@ -180,20 +188,21 @@ def optimise_trajectory(
         UserWarning: if the smoothing reaches contacts with friction that hold bodies to the floor.
 
     Raises:
-        ValueError: if shapes do not fit, a limit is above its opposite, or the schedule is empty or not positive.
+        ValueError: if shapes do not fit, a limit is above its opposite, an argument is of another kind or not finite, or the
+            schedule is empty or not positive.
 
     References:
         Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143 (iLQR on
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
+    one_key(key)
+    instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
     start, controls = jnp.asarray(start), jnp.asarray(controls)
     factors = jnp.asarray(schedule, start.dtype)
     lower, upper = system.limits(lower, upper, start.dtype)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
-    if controls.shape[1] != system.num_controls or not len(controls):
-        wanted = f"(horizon, {system.num_controls}) with a horizon of at least 1"
-        raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
+    sequence_of(controls, None, None, system.num_controls)
     if factors.ndim != 1 or not factors.size:
         raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
     given, low, high = known(factors), known(lower), known(upper)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import form, known, whole
+from mjxgrad._arrays import form, instance, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad.native import INPUTS
-from mjxgrad.rollouts.state import State
+from mjxgrad.rollouts.state import State, check_scene
 from mjxgrad.scene import Scene, SceneError
 from mjxgrad.stepping import Contact, OwnMotion, check_contact
 
@@ -49,8 +49,10 @@ def _real(name: str, value: Any) -> Array:
     return jnp.asarray(value)
 
 
-def check_shapes(scene: Scene, state: State) -> None:
-    """Refuse a state of another scene, or several states at once."""
+def check_start(scene: Any, state: Any) -> None:
+    """Refuse what is no scene or no state, a state of another scene, or several states at once."""
+    check_scene(scene)
+    instance("state", state, State, "of mg.initial_state, or the end of a rollout")
     for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na)):
         if (shape := jnp.shape(getattr(state, name))) != (size,):
             remedy = "map over batches with jax.vmap"

@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native import linearise as by_mujoco
-from mjxgrad.rollouts.arguments import arguments_of, native_motion
+from mjxgrad.rollouts.arguments import arguments_of, check_start, native_motion, sequence_of
 from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Slope, step
@@ -46,7 +46,9 @@ def linearise(
     Raises:
         ValueError: as `rollout`.
     """
+    check_start(scene, state)
     ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
+    sequence_of(ctrl[None], None, 1, scene.model.nu)
     native = native_motion(scene, contact)
     if native is not None:
         start, resting = arguments_of(scene, state)

@@ -15,6 +15,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from mjxgrad._arrays import instance
+from mjxgrad._text import write
+from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -62,6 +65,9 @@ def frames(
         RenderingUnavailableError: if there is no OpenGL.
     """
     mj_model = scene.mj_model if isinstance(scene, Scene) else scene
+    instance("scene", mj_model, mujoco.MjModel, "of mg.load_scene, or a mujoco.MjModel")
+    if isinstance(qpos, Trajectory):
+        raise ValueError("qpos must be positions, got a trajectory: give its .qpos")
     if timestep is None:
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
     positions = np.asarray(qpos, dtype=np.float64)
@@ -114,6 +120,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
         fps: frames per second.
 
     Raises:
+        ValueError: if the video has no frames.
         OSError: if the file cannot be written.
         RuntimeError: if ffmpeg fails, or is not installed.
     """
@@ -125,19 +132,15 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
         raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
     path, video = Path(path), np.asarray(video)
+    if video.ndim != 4 or not len(video):
+        raise ValueError(f"video must have shape (frames, height, width, 3), got {video.shape}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path must be in an existing folder, got {path}")
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     # Compressed to memory: a full disk then raises Python's own OSError, not a page of ffmpeg's output.
     even = video[:, : video.shape[1] // 2 * 2, : video.shape[2] // 2 * 2]
-    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     # The index at the front lets a browser start before all is read.
-    content = mediapy.compress_video(even, codec="h264", fps=fps, crf=23, ffmpeg_args="-movflags +faststart")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write(path, mediapy.compress_video(even, codec="h264", fps=fps, crf=23, ffmpeg_args="-movflags +faststart"))
 
 
 def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Float, PyTree
 from mjxgrad._programs import is_traced
 from mjxgrad.rollouts import arguments, by_mjx, by_mujoco
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees
-from mjxgrad.rollouts.state import State, check_scene
+from mjxgrad.rollouts.state import State
 from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact, Discrete, Smoothing, smoothing_warnings
@@ -68,9 +68,7 @@ def rollout(
             is missing or contradicted, or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as
             diverged at this step).
     """
-    check_scene(scene)
-    if not isinstance(state, State):
-        raise ValueError(f"state must be of mg.initial_state, or the end of a rollout, got {type(state).__name__}")
+    arguments.check_start(scene, state)
     native = arguments.native_motion(scene, contact)
     for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
@@ -78,7 +76,6 @@ def rollout(
         raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
     policy = controls if callable(controls) else None
     sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
-    arguments.check_shapes(scene, state)
     forces = arguments.applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     if native is not None:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from mjxgrad._arrays import is_known, known
+from mjxgrad._arrays import instance, is_known, known
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import geom_name
 from mjxgrad.scene import Scene, SceneWarning
@@ -150,5 +150,4 @@ def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
 
 def check_scene(scene: Any) -> None:
     """Refuse an argument that is no scene."""
-    if not isinstance(scene, Scene):
-        raise ValueError(f"scene must be of mg.load_scene, got {type(scene).__name__}")
+    instance("scene", scene, Scene, "of mg.load_scene")

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjxgrad._arrays import instance
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad._warnings import collected
 from mjxgrad.batched.device import own_device
@@ -76,8 +77,8 @@ def load_scene(
         SceneError: if MuJoCo cannot read the MJCF, or nothing in it can move. Where MJX is asked for, also if MJX cannot
             simulate it, with all unsupported features, or loading would take minutes by the number of geom pairs.
     """
-    if softness is not None and not isinstance(softness, Softness):
-        raise ValueError(f"softness must be mg.Softness, such as mg.Softness(stiffness=1e4), got {softness!r}")
+    if softness is not None:
+        instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
     if max_contacts is not None and max_contacts < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:

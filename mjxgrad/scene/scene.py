@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import is_known
+from mjxgrad._arrays import instance, is_known
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
@@ -83,6 +83,7 @@ class Scene(eqx.Module):
         Raises:
             ValueError: as `Softness.apply`.
         """
+        instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
         scene = eqx.tree_at(lambda s: s.model, self, softness.apply(self.model))
         for message in softness_warnings(softness, scene.model) + scene.warnings():
             _warn(self, message)

@@ -71,6 +71,11 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
         NotImplementedError: if MJX lacks the integrator.
     """
     check_contact(contact, is_step=True)
+    if not (hasattr(model, "opt") and hasattr(data, "ctrl")):
+        given = f"{type(model).__name__} and {type(data).__name__}"
+        raise ValueError(
+            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
+        )
     if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
         kind = model.opt.integrator
         raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")

@@ -229,6 +229,18 @@ def _moved(kind):
     return mover.move(kind, states, np.zeros((3, 20, 1)), direction, (5, 20))
 
 
+def test_an_interruption_keeps_what_was_measured(monkeypatch):
+    """The line before it; noise and the other lines are named."""
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mjxgrad.checking.measure._Probe.noise", interrupted)
+    measured = mg.check(ball(), budget=1000).measured
+    assert len(measured.lines) == 1
+    assert len(measured.left_out) > 3
+
+
 def test_derivatives_along_a_line_are_those_of_a_rollout():
     """Of the start by 0.3 m and 1 m/s, and of the push by 0.1 N."""
     scene = mg.load_scene(ball(height=0.06))

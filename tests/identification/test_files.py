@@ -65,6 +65,8 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
     ("columns", "said"),
     [
         ({"x": [1, 2]}, "must have a column named time"),
+        ({"time": [0, 1, 1], "place": [1, 2, 3]}, "time in .* must increase, got 1, then 1"),
+        ({"time": [], "place": []}, "must have at least two rows of numbers, got 0"),
         ({"time": [0, 1], "x": [1, 2]}, "must say what it is, as one of ctrl:x, qpos:x"),
         ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo"),
         ({"time": [0, 1], "ctrl:x": [0, 0], "servo": [0, 0], "palce": [1, 2]}, "did you mean place"),
@@ -77,6 +79,20 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
         files.recording(scene, tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.csv", bytes(range(256)), "a.csv must be a line of names, then numbers"),
+        ("a.npz", bytes(range(256)), "a.npz must be an NPZ with arrays of numbers"),
+        ("a.csv", b"time,x\n0,1,2", "line 2 has 3 cells, not 2"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_named(scene, tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=said):
+        files.recording(scene, tmp_path / name)
+
+
 def named(scene, given):
     return {text.partition("=")[0]: files.parameter(scene, text) for text in given}
 
@@ -85,7 +101,13 @@ def test_parameters_are_named_in_a_word(scene):
     given = ["mass:cart=0.5..3", "friction:floor/ball", "damping:x", "gains:servo", "delay=0..0.1"]
     found = named(scene, given)
     assert (found["mass:cart"].nominal, found["mass:cart"].upper, found["delay"].upper) == (2.0, 3.0, 0.1)
-    for wrong, said in (("weight:cart", "kind one of mass"), ("mass", "must say of what"), ("gear:no", "no")):
+    refused = {
+        "weight:cart": "kind one of mass",
+        "mass": "must say of what",
+        "gear:no": "no",
+        "mass:cart=-1..1": "negative",
+    }
+    for wrong, said in refused.items():
         with pytest.raises(ValueError, match=said):
             files.parameter(scene, wrong)
 

@@ -3,13 +3,13 @@
 import dataclasses
 import functools
 import time
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from IPython.lib.pretty import pretty
 
 import mjxgrad as mg
 from tests.loop import problems
@@ -141,10 +141,9 @@ def test_a_run_that_never_took_a_step_does_not_say_that_all_were_done(key):
 
 
 def test_a_result_is_shown_as_a_sentence(zeroth_order_run):
-    shown = []
-    zeroth_order_run._repr_pretty_(SimpleNamespace(text=shown.append), cycle=False)
-    assert shown == [str(zeroth_order_run)]
-    assert shown[0].startswith(
+    """By `print`, and by IPython as a notebook does."""
+    assert pretty(zeroth_order_run) == str(zeroth_order_run)
+    assert str(zeroth_order_run).startswith(
         f"Best cost {float(zeroth_order_run.best_cost):.4g} after 250 steps, 0 skipped: all steps were done"
     )
 
