@@ -37,6 +37,11 @@ LINEAR = {
 _WAYS = (maps._bilinear_by_slices, maps._bilinear_by_gathers)
 
 
+def _normal(seed, shape):
+    """Return random numbers by NumPy: JAX would compile a program for each shape."""
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape))
+
+
 def _table(bilinear, of_first, of_second):
     table = np.zeros((bilinear._size, of_first, of_second))
     for k, i, j, coefficient in bilinear._terms:
@@ -57,7 +62,7 @@ def _sizes(bilinear):
 def test_a_bilinear_map_is_its_sum(name, evaluate):
     bilinear = BILINEAR[name]
     sizes = _sizes(bilinear)
-    a, b = (jax.random.normal(jax.random.key(seed), (3, 2, size)) for seed, size in enumerate(sizes))
+    a, b = (_normal(seed, (3, 2, size)) for seed, size in enumerate(sizes))
     found = evaluate(a, b, terms=bilinear._terms, size=bilinear._size, batch=0)
     np.testing.assert_allclose(
         found, np.einsum("kij,...i,...j->...k", _table(bilinear, *sizes), a, b), rtol=0, atol=1e-13
@@ -86,12 +91,12 @@ def test_an_item_that_is_no_number_spoils_only_gathered_sums_of_it(name):
 
 def test_chosen_items_have_the_derivative_of_an_index():
     """In both modes, whatever the derivatives of those that are not chosen."""
-    index, x = jnp.array([[2, 0], [2, 2]]), jax.random.normal(jax.random.key(0), (4, 3))
-    change = jax.random.normal(jax.random.key(1), x.shape).at[1].set(jnp.nan)
+    index, x = jnp.array([[2, 0], [2, 2]]), _normal(0, (4, 3))
+    change = _normal(1, x.shape).at[1].set(jnp.nan)
     found, moved = jax.jvp(lambda x: maps.choose(index, x), (x,), (change,))
     np.testing.assert_array_equal(found, x[index])
     np.testing.assert_allclose(moved, change[index], rtol=1e-14)
-    cotangent = jax.random.normal(jax.random.key(2), found.shape)
+    cotangent = _normal(2, found.shape)
     (pulled,) = jax.vjp(lambda x: maps.choose(index, x), x)[1](cotangent)
     np.testing.assert_allclose(pulled, jnp.zeros_like(x).at[index].add(cotangent), rtol=1e-14)
 
@@ -101,7 +106,7 @@ def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
     bilinear = BILINEAR[name]
     sizes = _sizes(bilinear)
     table = _table(bilinear, *sizes)
-    a, b, cotangent = (jax.random.normal(jax.random.key(size), (4, size)) for size in (*sizes, bilinear._size))
+    a, b, cotangent = (_normal(size, (4, size)) for size in (*sizes, bilinear._size))
     by_a, by_b = jax.vjp(jax.vmap(bilinear), a, b)[1](cotangent)
     np.testing.assert_allclose(by_a, np.einsum("kij,nk,nj->ni", table, cotangent, b), rtol=0, atol=1e-13)
     np.testing.assert_allclose(by_b, np.einsum("kij,nk,ni->nj", table, cotangent, a), rtol=0, atol=1e-13)
@@ -112,7 +117,7 @@ def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
 @pytest.mark.parametrize("name", LINEAR)
 def test_a_linear_map_is_its_sum(name, axis, evaluate):
     matrix = LINEAR[name]
-    x = jax.random.normal(jax.random.key(0), np.insert([3, 2], axis, matrix.shape[1]))
+    x = _normal(0, np.insert([3, 2], axis, matrix.shape[1]))
     found = evaluate(x, matrix=maps._Matrix(matrix), batch=axis)
     np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), rtol=0, atol=1e-13)
 
@@ -122,7 +127,7 @@ def test_a_linear_map_is_its_sum(name, axis, evaluate):
 def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
     matrix = LINEAR[name]
     shapes = [np.insert([size, 2], batch, 3) for size in matrix.shape[::-1]]
-    x, cotangent = (jax.random.normal(jax.random.key(seed), shape) for seed, shape in enumerate(shapes))
+    x, cotangent = (_normal(seed, shape) for seed, shape in enumerate(shapes))
     mapped = jax.vmap(lambda x: maps.combine(matrix, x), batch, batch)
     (found,) = jax.vjp(mapped, x)[1](cotangent)
     contracted = 1 - batch
@@ -146,7 +151,12 @@ _SIZES = dict(zip("nijkcdva", (4, 3, 2, 5, 2, 3, 4, 6), strict=True))
 def _factors(subscripts, *leading):
     first, second, _ = subscripts.replace("->", ",").split(",")
     shapes = [(*leading, *(_SIZES[letter] for letter in letters)) for letters in (first, second)]
-    return [jax.random.normal(jax.random.key(seed), shape) for seed, shape in enumerate(shapes)]
+    return [_normal(seed, shape) for seed, shape in enumerate(shapes)]
+
+
+def _with_transposes(function, a, b, cotangent):
+    value, pull = jax.vjp(function, a, b)
+    return value, *pull(cotangent)
 
 
 @pytest.mark.parametrize("subscripts", CONTRACTIONS)
@@ -163,11 +173,14 @@ def test_a_contraction_and_its_derivatives_are_those_of_the_einstein_sum(subscri
         mapped = functools.partial(maps.contract, subscripts)
         for _ in leading:
             mapped = jax.vmap(mapped, (0, None if share_second else 0))
-        expected, pull = jax.vjp(lambda a, b: jnp.einsum(every, a, b), a, other)
-        found, ours = jax.vjp(mapped, a, other)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
-        cotangent = jax.random.normal(jax.random.key(2), expected.shape)
-        for one, two in zip(ours(cotangent), pull(cotangent), strict=True):
+
+        cotangent = _normal(2, np.einsum(every, a, other).shape)
+        both = jax.jit(
+            lambda *x, mapped=mapped: [
+                _with_transposes(way, *x) for way in (mapped, functools.partial(jnp.einsum, every))
+            ]
+        )
+        for one, two in zip(*both(a, other, cotangent), strict=True):
             np.testing.assert_allclose(one, two, rtol=0, atol=1e-12)
 
 
@@ -188,7 +201,7 @@ def _chain(x):
 
 def test_on_a_cpu_the_batch_is_last_in_memory_from_one_sum_to_the_next():
     """In the program that is compiled, with its operations between them, and with their derivatives."""
-    x = jax.random.normal(jax.random.key(0), (32, 4, 3))
+    x = _normal(0, (32, 4, 3))
     compiled = jax.jit(jax.vmap(jax.value_and_grad(lambda x: _chain(x).sum()))).lower(x).compile().as_text()
     layouts = re.findall(r"= f64\[32,4,3\]\{([\d,]*)\} fusion", compiled)
     assert layouts.count("0,2,1") >= 3

@@ -105,6 +105,7 @@ def test_a_sweep_of_gymnasiums_pendulum_is_one_line(tmp_path, monkeypatch, capsy
     monkeypatch.chdir(tmp_path)
     Path("upright.py").write_text("def cost(trajectory):\n    return (trajectory.qpos[-1] ** 2).sum()\n")
     arguments = ["--cost", "upright.py:cost", "--horizon", "10", "--samples", "32", "--gradient", "discrete"]
+    arguments += ["--engine", "mujoco"]  # which compiles nothing
     assert cli.main(["sweep", PENDULUM, *arguments]) == 0
     said = capsys.readouterr().out
     assert "a constant control of slide" in said
@@ -117,7 +118,8 @@ def test_without_actuators_it_is_by_the_velocity_at_the_start(tmp_path):
     (tmp_path / "ball.xml").write_text(
         '<mujoco><worldbody><body name="ball"><joint type="slide" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>'
     )
-    found = mg.sweep(tmp_path / "ball.xml", "height:ball", horizon=50, num_samples=32, num_reference=200)
+    sizes = {"horizon": 50, "num_samples": 32, "num_reference": 200}
+    found = mg.sweep(tmp_path / "ball.xml", "height:ball", contact=mg.Discrete("mujoco"), **sizes)
     assert "velocity of the joint at the start" in found.question
     np.testing.assert_allclose(found.result.first.value, -0.1, rtol=1e-6)
     np.testing.assert_allclose(found.result.table()["truth"], -0.1, rtol=0.05)

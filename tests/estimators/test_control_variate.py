@@ -13,6 +13,7 @@ from mjxgrad import estimators
 from mjxgrad.estimators import Diagnosis, rules
 from mjxgrad.objective import closed_loop, parameter_noise
 from tests.estimators import textbook
+from tests.estimators.textbook import repeat
 from tests.objective.test_objective import Laplace
 
 control_variate = eqx.filter_jit(estimators.control_variate)
@@ -30,11 +31,6 @@ def jumpy_gradient():
     return textbook.bumpy_gradient(np.asarray(POINT), np.asarray(STDDEVS)) + np.array([0, jump, 0])
 
 
-def repeat(estimator, objective, params, times, **settings):
-    keys = jax.random.split(jax.random.key(3), times)
-    return jax.jit(jax.vmap(lambda key: estimator(objective, params, key, **settings)))(keys)
-
-
 def assert_unbiased_with_right_errors(estimates, truth, num_samples):
     values, times = np.asarray(estimates.value), len(estimates.value)
     spread = values.std(axis=0)
@@ -48,7 +44,7 @@ def assert_unbiased_with_right_errors(estimates, truth, num_samples):
 @pytest.mark.parametrize("num_samples", [4, pytest.param(12, marks=pytest.mark.slow)])
 def test_it_is_unbiased_at_a_jump_from_few_samples_on(num_samples):
     objective = parameter_noise(jumpy, STDDEVS)
-    estimates = repeat(estimators.control_variate, objective, POINT, 40_000, num_samples=num_samples)
+    estimates = repeat(estimators.control_variate, objective, POINT, 40_000, seed=3, num_samples=num_samples)
     assert_unbiased_with_right_errors(estimates, jumpy_gradient(), num_samples)
 
 
@@ -79,7 +75,7 @@ def test_it_is_unbiased_in_closed_loop_from_random_starts_and_so_are_baselines_f
     task, params = TwoStarts(), {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
     objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
     flat = objective.ravel(params)
-    estimates = repeat(estimator, objective, flat, 20_000, num_samples=8)
+    estimates = repeat(estimator, objective, flat, 20_000, seed=3, num_samples=8)
     truth = jax.jit(jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2)))(flat)
     assert_unbiased_with_right_errors(estimates, np.asarray(truth), 8)
     assert np.all(np.asarray(estimates.num_rollouts) == num_rollouts)
@@ -100,7 +96,7 @@ def test_baselines_from_the_same_start_take_away_what_starts_do():
     paired = functools.partial(estimators.alpha_order, rule=rule, control_variate=False)
     from_same_start = functools.partial(estimators.zeroth_order, baseline="zero_noise")
     partner, silence, others = (
-        np.asarray(repeat(estimator, objective, flat, 500, num_samples=20).value).std(axis=0)
+        np.asarray(repeat(estimator, objective, flat, 500, seed=3, num_samples=20).value).std(axis=0)
         for estimator in (paired, from_same_start, estimators.zeroth_order)
     )
     np.testing.assert_array_less(partner, 0.3 * others)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad.objective import ParameterNoise, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import first_order, zeroth_order
+from tests.estimators.textbook import first_order, repeat, zeroth_order
 
 EVERY_WAY = [(baseline, pairs) for baseline in ("leave_one_out", "zero_noise", "none") for pairs in (False, True)]
 
@@ -23,11 +23,6 @@ class HalfMirrored(ParameterNoise):
 
     def mirror(self, noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
         return noise * jnp.array([-1.0, 1.0])
-
-
-def repeat(objective, estimator, point, *, times: int, seed: int, **settings):
-    keys = jax.random.split(jax.random.key(seed), times)
-    return jax.jit(jax.vmap(lambda key: estimator(objective, point, key, **settings)))(keys)
 
 
 def assert_errors_are_right(estimates, num_repetitions: int) -> None:
@@ -51,7 +46,7 @@ def assert_errors_are_right(estimates, num_repetitions: int) -> None:
 def test_an_estimate_knows_its_error_even_from_three_samples(estimator, settings):
     times, num_samples = 20_000, 6 if settings.get("antithetic") else 3
     objective, point = parameter_noise(slanted, jnp.array([0.3, 0.5])), jnp.array([0.4, -0.7])
-    estimates = repeat(objective, estimator, point, times=times, seed=1, num_samples=num_samples, **settings)
+    estimates = repeat(estimator, objective, point, times=times, seed=1, num_samples=num_samples, **settings)
     assert_errors_are_right(estimates, times)
 
 
@@ -59,7 +54,7 @@ def test_pairs_whose_scores_do_not_cancel_know_their_error():
     times = 20_000
     objective = HalfMirrored(jax.tree_util.Partial(slanted), jnp.array([0.3, 0.5]), 2)
     point = jnp.array([0.4, -0.7])
-    estimates = repeat(objective, zeroth_order, point, times=times, seed=2, num_samples=6, antithetic=True)
+    estimates = repeat(zeroth_order, objective, point, times=times, seed=2, num_samples=6, antithetic=True)
     assert_errors_are_right(estimates, times)
     # E f over the Gaussian has this gradient by hand: 3 + 8x + y and -1 + x.
     exact = np.array([3 + 8 * 0.4 - 0.7, -1 + 0.4])
@@ -82,14 +77,8 @@ def test_the_leave_one_out_baseline_halves_the_error_at_a_jump():
 
 def test_the_mean_cost_knows_its_error():
     times, point = 4000, 0.3
-    estimates = repeat(
-        parameter_noise(textbook.quadratic_sine, textbook.STDDEV),
-        first_order,
-        jnp.array([point]),
-        times=times,
-        seed=8,
-        num_samples=20,
-    )
+    objective = parameter_noise(textbook.quadratic_sine, textbook.STDDEV)
+    estimates = repeat(first_order, objective, jnp.array([point]), times=times, seed=8, num_samples=20)
     # E x² = θ² + σ², E sin(ωx) = exp(-ω²σ²/2) sin(ωθ).
     exact = point**2 + 0.01 + 0.1 * np.exp(-(20**2) * 0.01 / 2) * np.sin(20 * point)
     means, errors = np.asarray(estimates.objective_mean), np.asarray(estimates.objective_standard_error)

@@ -153,3 +153,9 @@ def assert_within_error(estimate: GradientEstimate, truth, num_errors: float = 4
     assert np.all(error <= num_errors * np.asarray(estimate.standard_error)), (estimate.value, truth)
     # An error bar as wide as the value proves nothing.
     assert np.all(np.asarray(estimate.standard_error) < 0.2 * np.abs(truth)), estimate.standard_error
+
+
+def repeat(estimator, objective, params, times: int, seed: int, **settings) -> GradientEstimate:
+    """Return as many estimates, each of its own noise."""
+    keys = jax.random.split(jax.random.key(seed), times)
+    return jax.jit(jax.vmap(lambda key: estimator(objective, params, key, **settings)))(keys)

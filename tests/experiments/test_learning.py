@@ -74,7 +74,15 @@ def test_a_reward_that_falls_again_is_not_the_soonest():
     assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["discrete"]
 
 
-COMMAND = ["run", "learn_cartpole", 'size="quick"', "sizes.num_updates=2", 'methods=["discrete"]', "precision=float64"]
+COMMAND = [
+    "run",
+    "learn_cartpole",
+    'size="quick"',
+    "sizes.num_updates=2",
+    "sizes.num_episodes=1",
+    'methods=["discrete"]',
+    "precision=float64",
+]
 
 
 def test_the_quick_size_runs_and_keeps_its_course(tmp_path):

@@ -31,7 +31,7 @@ LEGS = """<mujoco><default><geom friction=".9"/><joint axis="0 1 0" armature=".0
     <geom type="capsule" size=".04" fromto="0 0 0 0 0 -.4"/></body></body></body></worldbody></mujoco>"""
 
 
-def _compared(scene, index, interval, horizon, speeds, count=96, read=3):
+def _compared(scene, index, interval, horizon, speeds, count=48, read=3):
     """Return slope and mean derivative of the first coordinates, half way and at the end, over where the motion starts."""
 
     def outcome(place):
@@ -52,7 +52,7 @@ def _to_slope(outcome, interval, count):
 def test_a_bounce_has_minus_its_restitution_as_slope(h):
     """Critically damped contact of constant impedance leaves e⁻² of the speed; MuJoCo's own derivative is −3 at every step."""
     scene = mg.load_scene(BALL.format(h=h))
-    found = _compared(scene, 0, (0.0, 0.03), round(0.24 / h), [-2.0], read=1)
+    found = _compared(scene, 0, (0.0, 0.03), round(0.24 / h), [-2.0], count=96, read=1)
     np.testing.assert_allclose(found.mean[0, 1], found.slope[1], atol=0.02)
     np.testing.assert_allclose(found.mean[0, 1], -np.exp(-2), atol=0.02)  # the impedance is nearly constant
 
@@ -177,18 +177,18 @@ def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
         <body pos="-.3 0 .1"><joint name="p" type="slide" axis="1 0 0" damping="1"/><geom type="box" size=".05 .2 .05" mass="1"/>
         </body></worldbody><actuator><position joint="p" kp="200"/></actuator></mujoco>"""
     )
-    model.opt.tolerance, steps, targets = 1e-12, 300, np.linspace(0.5, 0.52, 65)
+    model.opt.tolerance, steps, targets = 1e-12, 300, np.linspace(0.5, 0.52, 33)
     start = {
-        "time": np.zeros((65, 1)),
-        "qpos": np.tile(model.qpos0, (65, 1)),
-        "qvel": np.zeros((65, 7)),
-        "act": np.zeros((65, 0)),
+        "time": np.zeros((33, 1)),
+        "qpos": np.tile(model.qpos0, (33, 1)),
+        "qvel": np.zeros((33, 7)),
+        "act": np.zeros((33, 0)),
     }
 
     def controls(refined):
         return np.repeat(targets[:, None, None], steps * refined, axis=1)
 
-    followed = (np.zeros((65, 14)), np.ones((65, steps, 1)))
+    followed = (np.zeros((33, 14)), np.ones((33, steps, 1)))
     slope = Engine(model).follow("slope", {}, start, {"ctrl": controls(1)}, followed)
     own = np.polyfit(targets, slope["qpos"][:, -1, 0], 1)[0]
     model.opt.timestep /= 16
@@ -230,7 +230,7 @@ def test_corners_that_land_together_are_taken_together(tilt, speeds):
         start = mg.initial_state(scene, scene.data.qpos.at[2].add(height), jnp.array([*speeds, 0, 0, 0]))
         return mg.rollout(scene, start, horizon=100, contact=mg.Slope("mujoco")).qpos[-1, 0]
 
-    found = _to_slope(outcome, (0.0, 0.02), 64)
+    found = _to_slope(outcome, (0.0, 0.02), 32)
     assert abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * abs(found.slope)
     assert found.spread[0] < 0.3 * abs(found.slope)
 
@@ -247,7 +247,7 @@ def test_a_cylinder_that_stands_on_a_box_has_the_slope_as_mean():
         start = mg.initial_state(scene, qvel=jnp.array([0.05, 0.02 + place, 0, 0.03, 0.02, 0.01]))
         return mg.rollout(scene, start, horizon=60, contact=mg.Slope()).qpos[-1, :2]
 
-    found = _to_slope(outcome, (-0.1, 0.1), 65)
+    found = _to_slope(outcome, (-0.1, 0.1), 33)
     assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope).max())
     assert np.all(found.spread[0] < 0.1 * np.abs(found.slope).max())
 
@@ -266,7 +266,7 @@ def test_a_cloth_that_lands_has_the_slope_as_mean():
         start = mg.initial_state(scene, qvel=speeds.at[2::3].add(place))
         return mg.rollout(scene, start, horizon=60, contact=mg.Slope()).qpos[-1, jnp.array([0, 2])]
 
-    found = _to_slope(outcome, (-0.3, 0.3), 65)
+    found = _to_slope(outcome, (-0.3, 0.3), 33)
     assert np.all(np.abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope))
     assert np.all(found.mean_error[0] < 0.2 * np.abs(found.slope).max())
 

@@ -123,27 +123,6 @@ def test_no_scene_of_gymnasium_has_jumps(name):
     assert _jumps(name, "continuous") < _ROUNDING
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("domain", ["hopper", "walker"])
-def test_no_scene_of_dm_control_has_jumps(domain):
-    suite = pytest.importorskip("dm_control.suite.common")
-    module = pytest.importorskip(f"dm_control.suite.{domain}")
-    text, assets = module.get_model_and_assets()
-    assert suite
-    scene = _scene(mujoco.MjModel.from_xml_string(text.decode() if isinstance(text, bytes) else text, assets))
-
-    @functools.partial(jax.jit, static_argnums=(1,))
-    def outcome(places, kind):
-        def at(place):
-            start = scene.data.replace(qpos=scene.data.qpos.at[0].add(0.02 * place), qvel=scene.data.qvel + place)
-            return _end(scene, start, 80, kind)
-
-        return jax.vmap(at)(places)
-
-    assert _largest_jump(lambda places: outcome(places, "continuous")) < _ROUNDING
-    assert _largest_jump(lambda places: outcome(places, "mujoco")) > 1e-5
-
-
 def test_the_mean_of_the_derivative_is_the_difference_of_the_outcome():
     """The fundamental theorem, over a tooth and a half; without the onset the jump is missing."""
     outcome, num_steps = _outcome("ball")

@@ -78,13 +78,6 @@ def test_reinforce_is_unbiased_for_a_policy(key, baseline):
     assert_within_error(reinforce(cost, at, key, num_samples=100_000, baseline=baseline), exact)
 
 
-def test_reinforce_is_unbiased_for_controls(key):
-    """The cost is quadratic in the controls, so noise adds a constant: the gradient is that without noise."""
-    cost = mg.open_loop(textbook.LinearSystem(), 0.3)
-    exact = jax.jit(jax.grad(lambda u: cost.task.run(u[:, None]).cost))(CONTROLS)
-    assert_within_error(reinforce(cost, CONTROLS, key, num_samples=100_000), exact)
-
-
 @pytest.mark.parametrize("baseline", ["leave_one_out", "none"])
 def test_an_action_answers_for_what_comes_after_it_and_no_more(key, baseline):
     """The sum written out, for a few rollouts of controls."""
