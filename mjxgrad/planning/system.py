@@ -15,8 +15,10 @@ from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.native import roll_out
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
+from mjxgrad.rollouts.arguments import arguments_of, native_motion
 from mjxgrad.rollouts.state import data_of, state_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete, check_contact, step
@@ -36,6 +38,11 @@ class System(eqx.Module):
 
     num_changes: eqx.AbstractVar[int]
     num_controls: eqx.AbstractVar[int]
+
+    @property
+    def num_coordinates(self) -> int:
+        """The number of coordinates of a state."""
+        return self.num_changes
 
     @abstractmethod
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
@@ -116,6 +123,10 @@ class SceneSystem(System):
         return 2 * self.scene.model.nv + self.scene.model.na
 
     @property
+    def num_coordinates(self) -> int:
+        return self.scene.model.nq + self.scene.model.nv + self.scene.model.na
+
+    @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.scene.model.nu
 
@@ -139,6 +150,11 @@ class SceneSystem(System):
         nq, nv = self.scene.model.nq, self.scene.model.nv
         qvel = state[nq : nq + nv]
         start = State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
+        native = native_motion(self.scene, self.contact)
+        if native is not None:
+            begin, resting = arguments_of(self.scene, start)
+            inputs = jax.tree.map(lambda x: jnp.stack([x] * self.num_substeps), resting | {"ctrl": control})
+            return jnp.concatenate([x[-1] for x in roll_out(self.scene, begin, inputs, native.gradient)])
 
         def advance(now: State, _: None) -> tuple[State, None]:
             data = data_of(self.scene, now, control)

@@ -1,5 +1,6 @@
 """Trajectory optimisation on smoothed linear models, whose smoothing decreases as the plan improves."""
 
+import functools
 import warnings
 
 import equinox as eqx
@@ -96,7 +97,7 @@ class Feedback(eqx.Module):
     is_sound: Bool[Array, ""]
 
 
-class _Course(eqx.Module):
+class Course(eqx.Module):
     """A trajectory, its controls and its cost."""
 
     states: Float[Array, "states state"]
@@ -104,7 +105,16 @@ class _Course(eqx.Module):
     cost: _Scalar
 
 
-class _Problem(eqx.Module):
+class Search(eqx.Module):
+    """The state of the search between iterations: its course, the best one without smoothing, and the unmoved coordinates."""
+
+    course: Course
+    best: Course
+    regularisation: _Scalar
+    unmoved: Bool[Array, " n"]
+
+
+class Problem(eqx.Module):
     """The constants of all iterations."""
 
     system: System
@@ -114,7 +124,15 @@ class _Problem(eqx.Module):
     lower: ControlVector
     upper: ControlVector
 
-    def run(self, smoother: Smoother | None, course: _Course, law: Feedback, step: ArrayLike) -> _Course:
+    def begin(self, start: StateVector, controls: _Controls) -> Search:
+        """Return the search before its first iteration."""
+        at_start = jnp.broadcast_to(start, (len(controls) + 1, *start.shape))
+        unknown = jnp.asarray(jnp.inf, start.dtype)
+        given = Course(at_start, jnp.clip(controls, self.lower, self.upper), unknown)
+        least = jnp.asarray(_LEAST_REGULARISATION, start.dtype)
+        return Search(given, given, least, jnp.zeros(self.system.num_changes, bool))
+
+    def run(self, smoother: Smoother | None, course: Course, law: Feedback, step: ArrayLike) -> Course:
         """Follow a course under a feedback law; a step of zero repeats its controls."""
         follows = jnp.asarray(step) > 0
 
@@ -131,9 +149,15 @@ class _Problem(eqx.Module):
         final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
         states = jnp.concatenate([states, final[None]])
         cost = self.cost.total(self.system, states, controls)
-        return _Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
+        return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
-    def law(self, smoother: Smoother, course: _Course, regularisation: _Scalar):
+    def no_law(self) -> Feedback:
+        """Return the law that repeats a course."""
+        horizon, n, m = len(self.keys), self.system.num_changes, self.system.num_controls
+        zeros = functools.partial(jnp.zeros, dtype=self.lower.dtype)
+        return Feedback(zeros((horizon, m)), zeros((horizon, m, n)), zeros(()), jnp.asarray(True))
+
+    def law(self, smoother: Smoother, course: Course, regularisation: _Scalar):
         """Return the feedback law around a course, and the unmoved coordinates."""
         system, cost, states, controls = self.system, self.cost, course.states, course.controls
         models = jax.vmap(lambda *at: smoother.linear_model(system, *at))(states[:-1], controls, self.keys)
@@ -186,76 +210,100 @@ def optimise_trajectory(
         Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143 (iLQR on
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
-    start, controls = jnp.asarray(start), jnp.asarray(controls)
-    factors = jnp.asarray(schedule, start.dtype)
-    lower, upper = system.limits(lower, upper, start.dtype)
+    start = jnp.asarray(start)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
-    if controls.shape[1] != system.num_controls or not len(controls):
+    controls, problem = problem_of(system, cost, controls, key, smoother, lower, upper, start.dtype)
+    return _improved(problem, start, controls, factors_of("schedule", schedule, start.dtype))
+
+
+def problem_of(
+    system: System,
+    cost: Cost,
+    controls: Float[ArrayLike, "horizon m"],
+    key: PRNGKeyArray,
+    smoother: Smoother,
+    lower: ArrayLike | None,
+    upper: ArrayLike | None,
+    dtype: jnp.dtype,
+) -> tuple[_Controls, "Problem"]:
+    """Check the arguments of `optimise_trajectory`, and return the controls and the constants of all iterations."""
+    given = jnp.asarray(controls, dtype)
+    if given.shape[1] != system.num_controls or not len(given):
         wanted = f"(horizon, {system.num_controls}) with a horizon of at least 1"
-        raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
-    if factors.ndim != 1 or not factors.size:
-        raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
-    given, low, high = known(factors), known(lower), known(upper)
-    if given is not None and not (given > 0).all():
-        raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
+        raise ValueError(f"controls must have shape {wanted}, got {given.shape}")
+    lowest, highest = system.limits(lower, upper, dtype)
+    low, high = known(lowest), known(highest)
     if low is not None and high is not None and not (low <= high).all():
         raise ValueError(f"lower must be at most upper, got {low} and {high}")
-    problem = _Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper)
-    return _improved(problem, start, controls, factors)
+    return given, Problem(system, cost, smoother, jax.random.split(key, len(given)), lowest, highest)
+
+
+def factors_of(name: str, schedule: Float[ArrayLike, " iterations"], dtype: jnp.dtype) -> Float[Array, " iterations"]:
+    """Return a schedule of smoothing as an array; refuse an empty one, and known factors that are not positive."""
+    factors = jnp.asarray(schedule, dtype)
+    if factors.ndim != 1 or not factors.size:
+        raise ValueError(f"{name} must be one factor per iteration, at least one, got shape {factors.shape}")
+    given = known(factors)
+    if given is not None and not (given > 0).all():
+        raise ValueError(f"{name} must be positive, got {given.min():g}: for no smoothing take Exact()")
+    return factors
 
 
 @compiled
-def _improved(problem: _Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
-    """Return the plan; its data are arguments, so that a receding horizon needs no new compilation."""
-    system, smoother, horizon = problem.system, problem.smoother, len(controls)
-    steps = jnp.array((0.0, *_STEPS), start.dtype)
-    at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
-    given = _Course(at_start, jnp.clip(controls, problem.lower, problem.upper), jnp.asarray(jnp.inf, start.dtype))
-
-    def iterate(carry, inputs):
-        course, best, regularisation, *_ = carry
-        factor, following, is_first = inputs
-        law, unmoved = problem.law(smoother.scaled(factor), course, regularisation)
-        tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
-        index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
-        course = jax.tree.map(lambda x: x[index], tried)
-        true = problem.run(None, course, law, 0.0)
-        best = jax.tree.map(lambda new, old: jnp.where(is_first | (true.cost < best.cost), new, old), true, best)
-        # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
-        change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
-        after = jnp.clip(change * regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
-        after = jnp.where(is_first, regularisation, after)
-        row = Iterations(factor, course.cost, true.cost, steps[index], law.promised)
-        return (course, best, after, unmoved), row
-
+def _improved(problem: Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
+    """Return the plan; its data are arguments, so that to plan again needs no new compilation."""
     # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
     inputs = (present, following, jnp.arange(len(present)) == 0)
-    nothing = jnp.zeros(system.num_changes, bool)
-    carry = (given, given, jnp.asarray(_LEAST_REGULARISATION, start.dtype), nothing)
-    (course, best, _, unmoved), rows = jax.lax.scan(iterate, carry, inputs)
+    found, rows = jax.lax.scan(lambda search, at: iterate(problem, search, *at), problem.begin(start, controls), inputs)
     start_cost, rows = rows.cost[0], jax.tree.map(lambda x: x[1:], rows)
     return Plan(
-        controls=best.controls,
-        states=best.states,
+        controls=found.best.controls,
+        states=found.best.states,
         start_cost=start_cost,
-        cost=best.cost,
+        cost=found.best.cost,
         iterations=rows,
-        unmoved=unmoved,
-        converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(course.cost)) & ~unmoved.any(),
+        unmoved=found.unmoved,
+        converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(found.course.cost)) & ~found.unmoved.any(),
         diverged=~jnp.all(jnp.isfinite(rows.smoothed_cost)),
     )
 
 
-def shifted(plan: Plan, num_steps: int = 1) -> _Controls:
+def iterate(
+    problem: Problem, search: Search, factor: _Scalar, following: _Scalar, is_first: Bool[ArrayLike, ""]
+) -> tuple[Search, Iterations]:
+    """Take one iteration under a factor of the smoothing; the first one computes the course of the given controls alone."""
+    system, smoother, course = problem.system, problem.smoother, search.course
+    law, unmoved = jax.lax.cond(
+        is_first,
+        lambda: (problem.no_law(), search.unmoved),
+        lambda: problem.law(smoother.scaled(factor), course, search.regularisation),
+    )
+    steps = jnp.array((0.0, *_STEPS), course.states.dtype)
+    tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
+    index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
+    course = jax.tree.map(lambda x: x[index], tried)
+    true = course if smoother.is_exact else problem.run(None, course, law, 0.0)
+    is_better = is_first | (true.cost < search.best.cost)
+    best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
+    # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
+    change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
+    after = jnp.clip(change * search.regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
+    after = jnp.where(is_first, search.regularisation, after)
+    row = Iterations(factor, course.cost, true.cost, steps[index], law.promised)
+    return Search(course, best, after, unmoved), row
+
+
+def shifted(plan: Plan | Course, num_steps: ArrayLike = 1) -> _Controls:
     """Return the controls of a plan some steps later, the last one held, as the next start of a receding horizon.
 
     Args:
         plan: the plan, whose first steps were taken.
         num_steps: number of steps taken.
     """
-    return plan.controls[np.minimum(np.arange(len(plan.controls)) + num_steps, len(plan.controls) - 1)]
+    last = len(plan.controls) - 1
+    return plan.controls[jnp.minimum(jnp.arange(last + 1) + num_steps, last)]
 
 
 def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: _Scalar) -> Bool[Array, " n"]:
