@@ -48,6 +48,9 @@ class Engine:
         self.pool, self.threads = mujoco.rollout.Rollout(nthread=_NUM_THREADS), ThreadPoolExecutor(_NUM_THREADS)
         self.data = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
         self.start = mujoco.MjData(mj_model)
+        self.plain = copy.deepcopy(mj_model)
+        # A state that is not finite stays so, and is seen.
+        self.plain.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.levers = levers_of(mj_model)
         bits = {name: getattr(_STATE, f"mjSTATE_{name.upper()}").value for name in (*START, "warmstart", *INPUTS)}
         begins = {name: mujoco.mj_stateSize(mj_model, _ALL & (bit - 1)) for name, bit in bits.items()}
@@ -150,9 +153,8 @@ class Engine:
             return np.broadcast_to(x, batch + x.shape[ndim:]).reshape(math.prod(batch), *x.shape[ndim:])
 
         varied = {name: flat(x) for name, x in values.items() if math.prod(x.shape[:ndim]) > 1}
-        base = with_numbers(self.mj_model, {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied})
-        # A state that is not finite stays so, and is seen.
-        base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        shared = {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied}
+        base = with_numbers(self.plain, shared) if shared else self.plain
         models = [base] * math.prod(batch)
         if varied:
             models = [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(len(models))]

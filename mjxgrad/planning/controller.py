@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import ArrayLike, Float, PRNGKeyArray
+from jaxtyping import ArrayLike, Float
 
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Exact, Smoother
 from mjxgrad.planning.system import Cost, System
-from mjxgrad.planning.trajectory import Course, Problem, Search, factors_of, iterate, problem_of, shifted
+from mjxgrad.planning.trajectory import Course, Problem, Search, checked, iterate, shifted
 from mjxgrad.rollouts import State
 
 # An iteration is expected to last as long as the longest before it. That fades, or one delay would cut all later decisions.
@@ -31,6 +31,7 @@ class Controller(Printed):
     made. `print` shows the rate and the missed deadlines.
 
     Attributes:
+        cost: cost of plans; to replace it by one with other arrays, such as a moved goal, compiles nothing.
         deadline: time of a decision (s), or None.
         seconds: durations of the decisions since the last reset (s).
         num_late: number of decisions that missed the deadline.
@@ -50,38 +51,35 @@ class Controller(Printed):
         deadline: float | None = None,
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
-        key: PRNGKeyArray | None = None,
     ):
-        """Compile one iteration.
+        """Compile an iteration; see `optimise_trajectory` for arguments that are not below.
 
         Args:
             system: the system; one decision is one step of it.
             cost: the cost of plans.
             controls: initial controls of the first decision, one row per step.
-            smoother: the smoother of the linear models at factor 1.
+            smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: positive factor of the smoothing in each iteration of a decision.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            deadline: the time of a decision (s). Its first part, the course of the shifted plan, is always computed.
-            lower: lower limits of the controls; None takes the actuators' own.
-            upper: upper limits of the controls, as `lower`.
-            key: key of the smoother's noise, which is the same in all decisions; None takes key 0.
+            deadline: the time of a decision (s); the course of the shifted plan is computed at least.
+            lower: lower limits of the controls.
+            upper: upper limits of the controls.
 
         Raises:
             ValueError: if the deadline is not positive, and as `optimise_trajectory`.
         """
         if deadline is not None and not deadline > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
-        dtype = jnp.result_type(float)
-        key = jax.random.key(0) if key is None else key
-        controls, problem = problem_of(system, cost, controls, key, smoother, lower, upper, dtype)
-        given = {"first_schedule": schedule if first_schedule is None else first_schedule, "schedule": schedule}
-        self._schedules = [np.asarray(factors_of(name, factors, dtype)) for name, factors in given.items()]
-        self.system, self.deadline, self._smoother, self._cost = system, deadline, smoother, _strong(cost)
-        self._none = problem.begin(jnp.zeros(system.num_coordinates, dtype), controls)
-        one, began = self._schedules[0][0], time.perf_counter()
-        start = np.zeros(system.num_coordinates, dtype)
-        lowered = eqx.filter_jit(_program(problem)).lower(self._cost, self._none, start, *_inputs(one, one))
-        self._iterate, self.compile_seconds = lowered.compile(), time.perf_counter() - began
+        began, first = time.perf_counter(), schedule if first_schedule is None else first_schedule
+        origin = system.origin
+        controls, factors, *limits = checked(system, controls, [*first, *schedule], lower, upper, origin.dtype)
+        problem = Problem(system, cost, smoother, jax.random.split(jax.random.key(0), len(controls)), *limits)
+        self.system, self.cost, self.deadline, self._smoother = system, cost, deadline, smoother
+        self._schedules, self._origin = np.split(np.asarray(factors), [len(first)]), np.asarray(origin)
+        self._iterate, self._none = _compiled(problem), problem.begin(origin, controls)
+        self.reset()
+        self._advance(self._origin, *self._schedules[0][[0, 0]], begins=True)
+        self.compile_seconds = time.perf_counter() - began
         self.reset()
 
     def reset(self) -> None:
@@ -95,22 +93,11 @@ class Controller(Printed):
         """The present plan; its cost is infinite if its states are not finite."""
         return self._search.best
 
-    @property
-    def cost(self) -> Cost:
-        """The cost of plans; it may be replaced by one with other numbers, such as with a moved goal."""
-        return self._cost
-
-    @cost.setter
-    def cost(self, cost: Cost) -> None:
-        if _kind(cost) != _kind(self._cost):
-            raise ValueError("cost must differ in the numbers of arrays alone; for any other make another Controller")
-        self._cost = _strong(cost)
-
     def __call__(self, state: State | mujoco.MjData | Float[ArrayLike, " state"]) -> Float[np.ndarray, " m"]:
         """Return the controls of the present step.
 
         Args:
-            state: present state: the vector of the system; for a scene also its `State`, or C MuJoCo's data.
+            state: the present state: a vector of the system, or for a scene its `State` or C MuJoCo's data.
 
         Warns:
             UserWarning: in a first decision, as `optimise_trajectory`.
@@ -122,45 +109,46 @@ class Controller(Printed):
         for message in self._smoother.warnings(self.system, start) if is_first else ():
             warnings.warn(message, stacklevel=2)
         limit = np.inf if self.deadline is None or is_first else self.deadline
-        factors = self._schedules[0 if is_first else 1]
-        began = time.perf_counter()
-        self._advance(start, _inputs(factors[0], factors[0], begins=True, num_steps=0 if is_first else 1))
+        factors, began = self._schedules[0 if is_first else 1], time.perf_counter()
+        self._advance(start, factors[0], factors[0], begins=True, num_steps=0 if is_first else 1)
         for factor, following in itertools.pairwise([*factors, factors[-1]]):
             before = time.perf_counter()
             if before - began + self._longest > limit:
                 self.num_cut += 1
                 break
-            self._advance(start, _inputs(factor, following))
+            self._advance(start, factor, following)
             self._longest = max(_FADING * self._longest, time.perf_counter() - before)
-        chosen = np.array(self.plan.controls)[0]
         self.seconds.append(time.perf_counter() - began)
         self.num_late += self.seconds[-1] > limit
-        return chosen
+        return np.array(self.plan.controls)[0]
 
-    def _advance(self, start: np.ndarray, inputs: tuple) -> None:
-        self._search = jax.block_until_ready(self._iterate(self._cost, self._search, start, *inputs))
+    def _advance(self, start: np.ndarray, *factors: Any, begins: bool = False, num_steps: int = 0) -> None:
+        # NumPy's numbers: each new one of JAX's would take a program to make.
+        inputs = (start, *factors, np.bool_(begins), np.int32(num_steps))
+        self._search = jax.block_until_ready(self._iterate(self.cost, self._search, *inputs))
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
         parts = [getattr(state, name) for name in ("qpos", "qvel", "act")] if hasattr(state, "qpos") else [state]
-        vector, shape = np.concatenate(parts).astype(self._none.course.states.dtype), (self.system.num_coordinates,)
-        if vector.shape != shape:
-            raise ValueError(f"state must have shape {shape} in this system, got {vector.shape}")
+        vector = np.concatenate(parts).astype(self._origin.dtype)
+        if vector.shape != self._origin.shape:
+            raise ValueError(f"state must have shape {self._origin.shape} in this system, got {vector.shape}")
         if not np.isfinite(vector).all():
             raise ValueError(f"state must be finite, got {vector.tolist()}")
         return vector
 
     def __str__(self) -> str:
+        compiled = f"compiled once, in {self.compile_seconds:.1f} s"
         if not self.seconds:
-            return f"no decision yet; compiled in {self.compile_seconds:.1f} s"
+            return f"no decision; {compiled}"
         rate = f"{len(self.seconds)} decisions, {format_number(1 / float(np.median(self.seconds)))} Hz in the median"
-        held = "" if self.deadline is None else f", {self.num_late} later than {format_number(1e3 * self.deadline)} ms"
-        cut = f", {self.num_cut} cut" if self.num_cut else ""
-        return f"{rate}{held}{cut}; compiled once, in {self.compile_seconds:.1f} s"
+        late = f", {self.num_late} later than {format_number(1e3 * self.deadline)} ms" if self.deadline else ""
+        return f"{rate}{late}{f', {self.num_cut} cut' * (self.num_cut > 0)}; {compiled}"
 
 
-def _program(problem: Problem):
-    """Return the function to compile: one iteration, of which the first begins at the last plan, some steps later."""
+def _compiled(problem: Problem):
+    """Return a compiled iteration; the first one of a decision begins at the last plan, some steps later."""
 
+    @eqx.filter_jit
     def run(cost: Cost, search: Search, start, factor, following, begins, num_steps) -> Search:
         one = dataclasses.replace(problem, cost=cost)
         fresh = one.begin(start, shifted(search.best, num_steps))
@@ -168,19 +156,3 @@ def _program(problem: Problem):
         return iterate(one, search, factor, following, begins)[0]
 
     return run
-
-
-def _inputs(factor: Any, following: Any, *, begins: bool = False, num_steps: int = 0) -> tuple[np.generic, ...]:
-    """Return the last arguments of the program; numbers of numpy, since those of JAX would be compiled."""
-    return factor, following, np.bool_(begins), np.int32(num_steps)
-
-
-def _strong(cost: Cost) -> Cost:
-    """Return a cost without weak types, which belong to a program's signature."""
-    return jax.tree.map(lambda x: x.astype(x.dtype) if eqx.is_array(x) else x, cost)
-
-
-def _kind(cost: Cost) -> tuple[list, Any]:
-    """Return what a program is compiled for."""
-    leaves, structure = jax.tree.flatten(cost)
-    return [jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x for x in leaves], structure

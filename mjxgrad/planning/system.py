@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native import roll_out
@@ -40,9 +41,9 @@ class System(eqx.Module):
     num_controls: eqx.AbstractVar[int]
 
     @property
-    def num_coordinates(self) -> int:
-        """The number of coordinates of a state."""
-        return self.num_changes
+    def origin(self) -> StateVector:
+        """A state: zeros, or the reference pose of a scene at rest."""
+        return jnp.zeros(self.num_changes)
 
     @abstractmethod
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
@@ -123,8 +124,8 @@ class SceneSystem(System):
         return 2 * self.scene.model.nv + self.scene.model.na
 
     @property
-    def num_coordinates(self) -> int:
-        return self.scene.model.nq + self.scene.model.nv + self.scene.model.na
+    def origin(self) -> StateVector:
+        return self.flatten(self.scene.data)
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -137,7 +138,7 @@ class SceneSystem(System):
         is_limited, ranges = np.asarray(model.actuator_ctrllimited, bool), model.actuator_ctrlrange
         return jnp.where(is_limited, ranges[:, 0], -jnp.inf), jnp.where(is_limited, ranges[:, 1], jnp.inf)
 
-    def flatten(self, state: State) -> StateVector:
+    def flatten(self, state: State | mjx.Data) -> StateVector:
         """Return a rollout's state as a vector, without time and warm start."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 

@@ -213,41 +213,33 @@ def optimise_trajectory(
     start = jnp.asarray(start)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
-    controls, problem = problem_of(system, cost, controls, key, smoother, lower, upper, start.dtype)
-    return _improved(problem, start, controls, factors_of("schedule", schedule, start.dtype))
+    controls, factors, *limits = checked(system, controls, schedule, lower, upper, start.dtype)
+    problem = Problem(system, cost, smoother, jax.random.split(key, len(controls)), *limits)
+    return _improved(problem, start, controls, factors)
 
 
-def problem_of(
+def checked(
     system: System,
-    cost: Cost,
     controls: Float[ArrayLike, "horizon m"],
-    key: PRNGKeyArray,
-    smoother: Smoother,
+    schedule: Float[ArrayLike, " iterations"],
     lower: ArrayLike | None,
     upper: ArrayLike | None,
     dtype: jnp.dtype,
-) -> tuple[_Controls, "Problem"]:
-    """Check the arguments of `optimise_trajectory`, and return the controls and the constants of all iterations."""
-    given = jnp.asarray(controls, dtype)
-    if given.shape[1] != system.num_controls or not len(given):
+) -> tuple[_Controls, Float[Array, " iterations"], ControlVector, ControlVector]:
+    """Return these arguments of `optimise_trajectory` as arrays; refuse those that do not fit."""
+    controls, factors = jnp.asarray(controls, dtype), jnp.asarray(schedule, dtype)
+    lower, upper = system.limits(lower, upper, dtype)
+    if controls.shape[1] != system.num_controls or not len(controls):
         wanted = f"(horizon, {system.num_controls}) with a horizon of at least 1"
-        raise ValueError(f"controls must have shape {wanted}, got {given.shape}")
-    lowest, highest = system.limits(lower, upper, dtype)
-    low, high = known(lowest), known(highest)
+        raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
+    if factors.ndim != 1 or not factors.size:
+        raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
+    given, low, high = known(factors), known(lower), known(upper)
+    if given is not None and not (given > 0).all():
+        raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
     if low is not None and high is not None and not (low <= high).all():
         raise ValueError(f"lower must be at most upper, got {low} and {high}")
-    return given, Problem(system, cost, smoother, jax.random.split(key, len(given)), lowest, highest)
-
-
-def factors_of(name: str, schedule: Float[ArrayLike, " iterations"], dtype: jnp.dtype) -> Float[Array, " iterations"]:
-    """Return a schedule of smoothing as an array; refuse an empty one, and known factors that are not positive."""
-    factors = jnp.asarray(schedule, dtype)
-    if factors.ndim != 1 or not factors.size:
-        raise ValueError(f"{name} must be one factor per iteration, at least one, got shape {factors.shape}")
-    given = known(factors)
-    if given is not None and not (given > 0).all():
-        raise ValueError(f"{name} must be positive, got {given.min():g}: for no smoothing take Exact()")
-    return factors
+    return controls, factors, lower, upper
 
 
 @compiled
