@@ -7,6 +7,7 @@ differences, `mjd_transitionFD`, in NumPy: the same cost, horizon and step lengt
 
 import statistics
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,16 +18,14 @@ import numpy as np
 from jaxtyping import Float
 
 import mjxgrad as mg
-from experiments.benchmarks import announce
-from experiments.benchmarks import ASSETS
+from experiments.benchmarks import ASSETS, announce
 from mjxgrad import planning
 from mjxgrad.tasks import scene_path
 
-Robot = Literal["cartpole", "hopper", "quadruped", "arm"]
-# The file; the time step (s) and how many of them are a step of the plan; its steps; the share of the weight of speeds.
+Robot = Literal["cartpole", "hopper", "quadruped"]
+# The file; the time step (s), how many of them are a step of the plan, and its steps.
 _ROBOTS: dict[Robot, tuple[Path, float, int, int]] = {
     "cartpole": (ASSETS / "inverted_pendulum.xml", 0.02, 2, 25),
-    "arm": (ASSETS / "pusher_v5.xml", 0.01, 4, 20),
     "hopper": (ASSETS / "hopper.xml", 0.005, 4, 20),
     "quadruped": (scene_path("quadruped"), 0.01, 1, 20),
 }
@@ -54,7 +53,7 @@ def rates(
         goal = np.concatenate([mujoco.MjData(model).qpos, np.zeros(model.nv)])
         weight = np.concatenate([np.ones(model.nv), np.full(model.nv, _SPEED)])
         scene = mg.load_scene(model)
-        chosen = {"plain iLQR": _Plain(model, goal, weight, horizon, num_substeps)}
+        chosen: dict[str, Callable] = {"plain iLQR": _Plain(model, goal, weight, horizon, num_substeps)}
         for engine in ("mjx", "mujoco"):
             system = planning.SceneSystem(scene=scene, num_substeps=num_substeps, contact=mg.Discrete(engine))  # pyright: ignore
             cost = planning.GoalCost(jnp.asarray(goal), weight, _TERMINAL * weight, _CONTROL)
@@ -62,7 +61,10 @@ def rates(
         for method, controller in chosen.items():
             seconds, off = _run(model, controller, decisions, num_substeps)
             first = getattr(controller, "compile_seconds", 0.0)
-            print(f"{name:10} {method:10} {1 / seconds:7.1f} Hz, compiled in {first:5.1f} s, ends {off:.3f} off", flush=True)
+            print(
+                f"{name:10} {method:10} {1 / seconds:7.1f} Hz, compiled in {first:5.1f} s, ends {off:.3f} off",
+                flush=True,
+            )
 
 
 def _run(model: mujoco.MjModel, controller, decisions: int, num_substeps: int) -> tuple[float, float]:
@@ -111,7 +113,7 @@ class _Plain:
             mujoco.mj_step(model, data, self.num_substeps)
             course.append(np.concatenate([data.qpos, data.qvel]))
         cost += 0.5 * _TERMINAL * self.weight @ self._away(course[-1], self.goal) ** 2
-        return np.array(course), np.array(done), cost
+        return np.array(course), np.array(done), float(cost)
 
     def _law(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         model, data, n = self.model, self.data, 2 * self.model.nv

@@ -52,7 +52,10 @@ def roll_out(
         by_number, by_start, by_input = tangents
         given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
         before = {k: jnp.concatenate([start[k][None], found[k][:-1]]) for k in found}
-        before["time"] = start["time"] + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
+        before["time"] = (
+            start["time"]
+            + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
+        )
         jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs)
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():

@@ -51,6 +51,7 @@ class Engine:
         self.plain = copy.deepcopy(mj_model)
         # A state that is not finite stays so, and is seen.
         self.plain.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.kept = ({}, self.plain)  # the last numbers that all of a batch shared, and their model
         self.levers = levers_of(mj_model)
         bits = {name: getattr(_STATE, f"mjSTATE_{name.upper()}").value for name in (*START, "warmstart", *INPUTS)}
         begins = {name: mujoco.mj_stateSize(mj_model, _ALL & (bit - 1)) for name, bit in bits.items()}
@@ -154,7 +155,10 @@ class Engine:
 
         varied = {name: flat(x) for name, x in values.items() if math.prod(x.shape[:ndim]) > 1}
         shared = {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied}
-        base = with_numbers(self.plain, shared) if shared else self.plain
+        content = {k: x.tobytes() for k, x in shared.items()}
+        if content != self.kept[0]:
+            self.kept = (content, with_numbers(self.plain, shared))
+        base = self.kept[1]
         models = [base] * math.prod(batch)
         if varied:
             models = [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(len(models))]

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import time
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,9 +20,6 @@ from mjxgrad.planning.system import Cost, System
 from mjxgrad.planning.trajectory import Course, Problem, Search, checked, iterate, shifted
 from mjxgrad.rollouts import State
 
-# An iteration is expected to last as long as the longest before it. That fades, or one delay would cut all later decisions.
-_FADING = 0.9
-
 
 class Controller(Printed):
     """Choose controls by planning anew in each step of a system.
@@ -34,8 +32,7 @@ class Controller(Printed):
         cost: cost of plans; to replace it by one with other arrays, such as a moved goal, compiles nothing.
         deadline: time of a decision (s), or None.
         seconds: durations of the decisions since the last reset (s).
-        num_late: number of decisions that missed the deadline.
-        num_cut: number of decisions that left out iterations because of it.
+        num_missed: number of decisions that the deadline cut short, or that ended after it.
         compile_seconds: duration of the compilation (s).
     """
 
@@ -46,47 +43,51 @@ class Controller(Printed):
         controls: Float[ArrayLike, "horizon m"],
         *,
         smoother: Smoother = Exact(),
-        schedule: Float[ArrayLike, " iterations"] = (1.0,),
-        first_schedule: Float[ArrayLike, " first"] | None = None,
+        schedule: Sequence[float] | Float[ArrayLike, " iterations"] = (1.0,),
+        first_schedule: Sequence[float] | Float[ArrayLike, " first"] | None = None,
         deadline: float | None = None,
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
     ):
-        """Compile an iteration; see `optimise_trajectory` for arguments that are not below.
+        """Compile an iteration; see `optimise_trajectory` for its arguments.
 
         Args:
             system: the system; one decision is one step of it.
             cost: the cost of plans.
             controls: initial controls of the first decision, one row per step.
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
-            schedule: positive factor of the smoothing in each iteration of a decision.
+            schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
             deadline: the time of a decision (s); the course of the shifted plan is computed at least.
             lower: lower limits of the controls.
             upper: upper limits of the controls.
+
+        Warns:
+            UserWarning: as `optimise_trajectory`, for a scene in its reference pose.
 
         Raises:
             ValueError: if the deadline is not positive, and as `optimise_trajectory`.
         """
         if deadline is not None and not deadline > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
-        began, first = time.perf_counter(), schedule if first_schedule is None else first_schedule
-        origin = system.origin
-        controls, factors, *limits = checked(system, controls, [*first, *schedule], lower, upper, origin.dtype)
-        problem = Problem(system, cost, smoother, jax.random.split(jax.random.key(0), len(controls)), *limits)
-        self.system, self.cost, self.deadline, self._smoother = system, cost, deadline, smoother
-        self._schedules, self._origin = np.split(np.asarray(factors), [len(first)]), np.asarray(origin)
-        self._iterate, self._none = _compiled(problem), problem.begin(origin, controls)
-        self.reset()
+        began, origin = time.perf_counter(), system.origin
+        for message in smoother.warnings(system, origin):
+            warnings.warn(message, stacklevel=2)
+        both = (schedule if first_schedule is None else first_schedule, schedule)
+        given = [checked(system, origin, controls, np.asarray(one), lower, upper) for one in both]
+        self._schedules, self._origin = [np.asarray(factors) for _, factors, *_ in given], np.asarray(origin)
+        start, _, *limits = given[0]
+        problem = Problem(system, cost, smoother, jax.random.split(jax.random.key(0), len(start)), *limits)
+        self.system, self.cost, self.deadline, self._none = system, cost, deadline, problem.begin(origin, start)
+        self._iterate, self._search = _compiled(problem), self._none
         self._advance(self._origin, *self._schedules[0][[0, 0]], begins=True)
         self.compile_seconds = time.perf_counter() - began
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan and the counts; the next decision is a first one."""
-        self._search, self._longest = self._none, 0.0
+        self._search, self._expected, self.num_missed = self._none, 0.0, 0
         self.seconds: list[float] = []
-        self.num_late = self.num_cut = 0
 
     @property
     def plan(self) -> Course:
@@ -99,32 +100,29 @@ class Controller(Printed):
         Args:
             state: the present state: a vector of the system, or for a scene its `State` or C MuJoCo's data.
 
-        Warns:
-            UserWarning: in a first decision, as `optimise_trajectory`.
-
         Raises:
             ValueError: if the state has another size than the system's, or is not finite.
         """
         start, is_first = self._vector(state), not self.seconds
-        for message in self._smoother.warnings(self.system, start) if is_first else ():
-            warnings.warn(message, stacklevel=2)
         limit = np.inf if self.deadline is None or is_first else self.deadline
-        factors, began = self._schedules[0 if is_first else 1], time.perf_counter()
+        factors, began, is_cut = self._schedules[0 if is_first else 1], time.perf_counter(), False
         self._advance(start, factors[0], factors[0], begins=True, num_steps=0 if is_first else 1)
         for factor, following in itertools.pairwise([*factors, factors[-1]]):
             before = time.perf_counter()
-            if before - began + self._longest > limit:
-                self.num_cut += 1
+            # An iteration is expected to last as long as the one before it.
+            if is_cut := before - began + self._expected > limit:
                 break
             self._advance(start, factor, following)
-            self._longest = max(_FADING * self._longest, time.perf_counter() - before)
+            self._expected = time.perf_counter() - before
         self.seconds.append(time.perf_counter() - began)
-        self.num_late += self.seconds[-1] > limit
+        self.num_missed += is_cut or self.seconds[-1] > limit
         return np.array(self.plan.controls)[0]
 
-    def _advance(self, start: np.ndarray, *factors: Any, begins: bool = False, num_steps: int = 0) -> None:
-        # NumPy's numbers: each new one of JAX's would take a program to make.
-        inputs = (start, *factors, np.bool_(begins), np.int32(num_steps))
+    def _advance(
+        self, start: np.ndarray, factor: Any, following: Any, *, begins: bool = False, num_steps: int = 0
+    ) -> None:
+        # NumPy's numbers: JAX would compile a program to make its own.
+        inputs = (start, factor, following, np.bool_(begins), np.int32(num_steps))
         self._search = jax.block_until_ready(self._iterate(self.cost, self._search, *inputs))
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
@@ -137,12 +135,9 @@ class Controller(Printed):
         return vector
 
     def __str__(self) -> str:
-        compiled = f"compiled once, in {self.compile_seconds:.1f} s"
-        if not self.seconds:
-            return f"no decision; {compiled}"
-        rate = f"{len(self.seconds)} decisions, {format_number(1 / float(np.median(self.seconds)))} Hz in the median"
-        late = f", {self.num_late} later than {format_number(1e3 * self.deadline)} ms" if self.deadline else ""
-        return f"{rate}{late}{f', {self.num_cut} cut' * (self.num_cut > 0)}; {compiled}"
+        rate = f"{format_number(1 / float(np.median(self.seconds or [np.inf])))} Hz in the median"
+        missed = f", {self.num_missed} missed {format_number(1e3 * self.deadline)} ms" if self.deadline else ""
+        return f"{len(self.seconds)} decisions, {rate}{missed}; compiled once, in {self.compile_seconds:.1f} s"
 
 
 def _compiled(problem: Problem):

@@ -56,11 +56,6 @@ class LinearModel(eqx.Module):
 class Smoother(eqx.Module):
     """A smoothed step with its derivative. The same key gives the same step, so that costs can be compared."""
 
-    @property
-    def is_exact(self) -> bool:
-        """Whether the smoothed step is the system's own."""
-        return False
-
     @abstractmethod
     def step(self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray) -> StateVector:
         """Return the next state of the smoothed system."""
@@ -88,10 +83,6 @@ class Analytic(Smoother):
     """
 
     smoothing: Smoothing | None
-
-    @property
-    def is_exact(self) -> bool:
-        return self.smoothing is None
 
     def step(self, system, state, control, key):
         return self._smoothed(system).step(state, control)

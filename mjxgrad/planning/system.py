@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
@@ -66,16 +66,6 @@ class System(eqx.Module):
         """The least and the largest control; infinite where there is no limit."""
         unlimited = jnp.full(self.num_controls, jnp.inf)
         return -unlimited, unlimited
-
-    def limits(
-        self, lower: ArrayLike | None, upper: ArrayLike | None, dtype: jnp.dtype
-    ) -> tuple[ControlVector, ControlVector]:
-        """Return given limits (a number, or one per control) for each control; None takes `control_limits`."""
-        low, high = (
-            jnp.broadcast_to(jnp.asarray(own if given is None else given, dtype), (self.num_controls,))
-            for given, own in zip((lower, upper), self.control_limits, strict=True)
-        )
-        return low, high
 
     def with_contact(self, contact: Contact) -> "System":
         """Return the system with its contacts stepped otherwise, such as smoothed.

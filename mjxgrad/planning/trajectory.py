@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad._arrays import known
 from mjxgrad._programs import compiled
-from mjxgrad.planning.linear_model import LinearModel, Smoother
+from mjxgrad.planning.linear_model import Analytic, LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 
 _Row = Float[Array, "*iterations"]
@@ -151,12 +151,6 @@ class Problem(eqx.Module):
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
-    def no_law(self) -> Feedback:
-        """Return the law that repeats a course."""
-        horizon, n, m = len(self.keys), self.system.num_changes, self.system.num_controls
-        zeros = functools.partial(jnp.zeros, dtype=self.lower.dtype)
-        return Feedback(zeros((horizon, m)), zeros((horizon, m, n)), zeros(()), jnp.asarray(True))
-
     def law(self, smoother: Smoother, course: Course, regularisation: _Scalar):
         """Return the feedback law around a course, and the unmoved coordinates."""
         system, cost, states, controls = self.system, self.cost, course.states, course.controls
@@ -213,22 +207,24 @@ def optimise_trajectory(
     start = jnp.asarray(start)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
-    controls, factors, *limits = checked(system, controls, schedule, lower, upper, start.dtype)
+    controls, factors, *limits = checked(system, start, controls, schedule, lower, upper)
     problem = Problem(system, cost, smoother, jax.random.split(key, len(controls)), *limits)
     return _improved(problem, start, controls, factors)
 
 
 def checked(
     system: System,
-    controls: Float[ArrayLike, "horizon m"],
-    schedule: Float[ArrayLike, " iterations"],
+    start: Array,
+    controls: ArrayLike,
+    schedule: ArrayLike,
     lower: ArrayLike | None,
     upper: ArrayLike | None,
-    dtype: jnp.dtype,
 ) -> tuple[_Controls, Float[Array, " iterations"], ControlVector, ControlVector]:
-    """Return these arguments of `optimise_trajectory` as arrays; refuse those that do not fit."""
+    """Return controls, schedule and limits of `optimise_trajectory` as arrays; refuse those that do not fit."""
+    dtype, shape, own = start.dtype, (system.num_controls,), system.control_limits
     controls, factors = jnp.asarray(controls, dtype), jnp.asarray(schedule, dtype)
-    lower, upper = system.limits(lower, upper, dtype)
+    lower = jnp.broadcast_to(jnp.asarray(own[0] if lower is None else lower, dtype), shape)
+    upper = jnp.broadcast_to(jnp.asarray(own[1] if upper is None else upper, dtype), shape)
     if controls.shape[1] != system.num_controls or not len(controls):
         wanted = f"(horizon, {system.num_controls}) with a horizon of at least 1"
         raise ValueError(f"controls must have shape {wanted}, got {controls.shape}")
@@ -263,20 +259,23 @@ def _improved(problem: Problem, start: StateVector, controls: _Controls, factors
 
 
 def iterate(
-    problem: Problem, search: Search, factor: _Scalar, following: _Scalar, is_first: Bool[ArrayLike, ""]
+    problem: Problem, search: Search, factor: _Scalar, following: _Scalar, is_first: Bool[Array, ""]
 ) -> tuple[Search, Iterations]:
     """Take one iteration under a factor of the smoothing; the first one computes the course of the given controls alone."""
-    system, smoother, course = problem.system, problem.smoother, search.course
+    smoother, course, zeros = problem.smoother, search.course, functools.partial(jnp.zeros, dtype=problem.lower.dtype)
+    gains = (*course.controls.shape, problem.system.num_changes)
+    nothing = Feedback(zeros(course.controls.shape), zeros(gains), zeros(()), jnp.asarray(True))
     law, unmoved = jax.lax.cond(
         is_first,
-        lambda: (problem.no_law(), search.unmoved),
+        lambda: (nothing, search.unmoved),
         lambda: problem.law(smoother.scaled(factor), course, search.regularisation),
     )
     steps = jnp.array((0.0, *_STEPS), course.states.dtype)
     tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
     index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
     course = jax.tree.map(lambda x: x[index], tried)
-    true = course if smoother.is_exact else problem.run(None, course, law, 0.0)
+    is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None
+    true = course if is_exact else problem.run(None, course, law, 0.0)
     is_better = is_first | (true.cost < search.best.cost)
     best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
     # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
