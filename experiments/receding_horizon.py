@@ -1,30 +1,24 @@
-"""How often a robot can be planned for anew: `make rates`.
+"""How often a robot can be planned for: `make rates`.
 
-Each robot is to stay at its first pose, for a horizon of equal steps. `planning.Controller` with one iteration in each decision,
-on MuJoCo's own motion by MJX and by C MuJoCo with its derivatives on all cores, is beside a plain iLQR on MuJoCo's own
-differences, `mjd_transitionFD`, in NumPy: the same cost, horizon and step lengths, one step after the other.
+Each robot is to stay at its first pose. `planning.Controller` takes one iteration in each decision, by MJX and by C MuJoCo, whose
+derivatives take all cores. Beside it is a plain iLQR on `mjd_transitionFD` in NumPy, of the same cost, horizon and step lengths.
 """
 
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Literal
 
-import cyclopts
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 import mjxgrad as mg
 from experiments.benchmarks import ASSETS, announce
 from mjxgrad import planning
 from mjxgrad.tasks import scene_path
 
-Robot = Literal["cartpole", "hopper", "quadruped"]
 # The file; the time step (s), how many of them are a step of the plan, and its steps.
-_ROBOTS: dict[Robot, tuple[Path, float, int, int]] = {
+_ROBOTS = {
     "cartpole": (ASSETS / "inverted_pendulum.xml", 0.02, 2, 25),
     "hopper": (ASSETS / "hopper.xml", 0.005, 4, 20),
     "quadruped": (scene_path("quadruped"), 0.01, 1, 20),
@@ -33,51 +27,36 @@ _SPEED, _TERMINAL, _CONTROL = 0.01, 10.0, 0.01  # weights of speeds, of the end,
 _LENGTHS = (1.0, 0.6, 0.3, 0.1, 0.03)
 
 
-def rates(
-    *,
-    robot: Annotated[tuple[Robot, ...], cyclopts.Parameter(consume_multiple=True, negative="")] = tuple(_ROBOTS),
-    decisions: int = 50,
-) -> None:
-    """Measure decisions of a receding horizon: ours on both engines, and a plain iLQR.
-
-    Args:
-        robot: the robots.
-        decisions: decisions of each; the median is printed.
-    """
+def rates(*, decisions: int = 50) -> None:
+    """Measure the rate of decisions: ours on both engines, and a plain iLQR's."""
     mg.keep_compiled()
     announce(f"{decisions} decisions of one iteration, float32")
-    for name in robot:
-        path, timestep, num_substeps, horizon = _ROBOTS[name]
+    for name, (path, timestep, num_substeps, horizon) in _ROBOTS.items():
         model = mujoco.MjModel.from_xml_path(str(path))
         model.opt.timestep, model.opt.integrator = timestep, mujoco.mjtIntegrator.mjINT_EULER
-        goal = np.concatenate([mujoco.MjData(model).qpos, np.zeros(model.nv)])
-        weight = np.concatenate([np.ones(model.nv), np.full(model.nv, _SPEED)])
+        goal, weight = np.concatenate([model.qpos0, np.zeros(model.nv)]), np.repeat([1.0, _SPEED], model.nv)
         scene = mg.load_scene(model)
         chosen: dict[str, Callable] = {"plain iLQR": _Plain(model, goal, weight, horizon, num_substeps)}
         for engine in ("mjx", "mujoco"):
             system = planning.SceneSystem(scene=scene, num_substeps=num_substeps, contact=mg.Discrete(engine))  # pyright: ignore
             cost = planning.GoalCost(jnp.asarray(goal), weight, _TERMINAL * weight, _CONTROL)
-            chosen[engine] = planning.Controller(system, cost, np.zeros((horizon, model.nu)))
+            ours = planning.Controller(system, cost, np.zeros((horizon, model.nu)))
+            chosen[f"{engine}, compiled in {ours.compile_seconds:.0f} s"] = ours
         for method, controller in chosen.items():
-            seconds, off = _run(model, controller, decisions, num_substeps)
-            first = getattr(controller, "compile_seconds", 0.0)
-            print(
-                f"{name:10} {method:10} {1 / seconds:7.1f} Hz, compiled in {first:5.1f} s, ends {off:.3f} off",
-                flush=True,
-            )
+            rate, off = _run(model, controller, decisions, num_substeps)
+            print(f"{name:10} {method:26} {rate:7.1f} Hz, {off:.3f} off in the end", flush=True)
 
 
 def _run(model: mujoco.MjModel, controller, decisions: int, num_substeps: int) -> tuple[float, float]:
-    """Return the median duration of a decision (s), and the largest distance of a joint from its goal in the end."""
+    """Return the median rate (Hz), and how far the worst coordinate is from its goal in the end."""
     data, seconds = mujoco.MjData(model), []
     data.qvel[:] = 0.1 * np.random.default_rng(0).normal(size=model.nv)
     for _ in range(decisions):
         began = time.perf_counter()
-        chosen = controller(data)
+        data.ctrl[:] = controller(data)
         seconds.append(time.perf_counter() - began)
-        data.ctrl[:] = chosen
         mujoco.mj_step(model, data, num_substeps)
-    return statistics.median(seconds), float(np.abs(data.qpos - mujoco.MjData(model).qpos).max())
+    return 1 / statistics.median(seconds), float(np.abs(data.qpos - model.qpos0).max())
 
 
 class _Plain:
@@ -87,13 +66,12 @@ class _Plain:
         self.model, self.goal, self.weight, self.num_substeps = model, goal, weight, num_substeps
         self.data, self.controls = mujoco.MjData(model), np.zeros((horizon, model.nu))
 
-    def __call__(self, data: mujoco.MjData) -> Float[np.ndarray, " nu"]:
+    def __call__(self, data: mujoco.MjData) -> np.ndarray:
         start = np.concatenate([data.qpos, data.qvel])
         given = np.concatenate([self.controls[1:], self.controls[-1:]])
-        still = np.zeros_like(given), np.zeros((len(given), self.model.nu, 2 * self.model.nv))
-        states, given, before = self._follow(start, None, given, *still, 0.0)
-        law = self._law(states, given)
-        tried = (self._follow(start, states, given, *law, length) for length in _LENGTHS)
+        states, given, before = self._follow(start, given)
+        law = (states, *self._law(states, given))
+        tried = (self._follow(start, given, law, length) for length in _LENGTHS)
         self.controls = next((controls for _, controls, cost in tried if cost < before), given)
         return self.controls[0]
 
@@ -102,11 +80,12 @@ class _Plain:
         mujoco.mj_differentiatePos(self.model, moved, 1.0, goal[:nq], state[:nq])
         return np.concatenate([moved, state[nq:] - goal[nq:]])
 
-    def _follow(self, start, states, controls, change, gain, length) -> tuple[np.ndarray, np.ndarray, float]:
+    def _follow(self, start, controls, law=None, length=1.0) -> tuple[np.ndarray, np.ndarray, float]:
         model, data, course, done, cost = self.model, self.data, [start], [], 0.0
         for t, control in enumerate(controls):
-            moved = 0.0 if states is None else length * change[t] + gain[t] @ self._away(course[-1], states[t])
-            done.append(np.clip(control + moved, *model.actuator_ctrlrange.T))
+            if law is not None:
+                control = control + length * law[1][t] + law[2][t] @ self._away(course[-1], law[0][t])
+            done.append(np.clip(control, *model.actuator_ctrlrange.T))
             cost += 0.5 * (self.weight @ self._away(course[-1], self.goal) ** 2 + _CONTROL * done[-1] @ done[-1])
             data.qpos[:], data.qvel[:] = np.split(course[-1], [model.nq])
             data.ctrl[:] = done[-1]
@@ -118,8 +97,7 @@ class _Plain:
     def _law(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         model, data, n = self.model, self.data, 2 * self.model.nv
         changes, gains = np.zeros((len(controls), model.nu)), np.zeros((len(controls), model.nu, n))
-        slope = _TERMINAL * self.weight * self._away(states[-1], self.goal)
-        curvature = _TERMINAL * np.diag(self.weight)
+        slope, curvature = _TERMINAL * self.weight * self._away(states[-1], self.goal), _TERMINAL * np.diag(self.weight)
         A, B = np.zeros((n, n)), np.zeros((n, model.nu))
         for t in reversed(range(len(controls))):
             data.qpos[:], data.qvel[:] = np.split(states[t], [model.nq])

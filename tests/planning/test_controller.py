@@ -21,7 +21,7 @@ def pendulum(state, control):
 
 @pytest.fixture(scope="module")
 def made():
-    system = FunctionSystem(pendulum, 2, 1)  # pyright: ignore
+    system = FunctionSystem(pendulum, 2, 1)
     return Controller(system, COST, GIVEN, schedule=[1.0], first_schedule=np.ones(5), deadline=1e-9, upper=2.0)
 
 
@@ -36,7 +36,7 @@ def controller(made):
 def test_a_pole_stands_by_a_hundred_decisions_that_compile_nothing(compilations):
     """From 0.4 rad in C MuJoCo, then in gymnasium; a decision is one call of gymnasium's step."""
     env = gymnasium.make("InvertedPendulum-v5").unwrapped
-    system = SceneSystem(scene=mg.load_scene(env.model), num_substeps=2)  # pyright: ignore
+    system = SceneSystem(scene=mg.load_scene(env.model), num_substeps=2)
     balance = Controller(system, GoalCost(jnp.zeros(4), 1.0, 10.0, 0.01), jnp.zeros((15, 1)), deadline=100.0)
     data, num_programs = mujoco.MjData(env.model), len(compilations)
     data.qpos[1] = 0.4
@@ -91,7 +91,7 @@ def test_a_scene_is_planned_by_c_mujoco_as_by_mjx(gradient):
     """A ball in air, two steps of 10 ms: the end, and its linear model."""
     ball = "<worldbody><body><joint type='slide' name='x' stiffness='50'/><geom size='.1'/></body></worldbody>"
     scene = mg.load_scene(f"<mujoco>{ball}<actuator><motor joint='x'/></actuator></mujoco>")
-    systems = [SceneSystem(scene=scene, num_substeps=2, contact=gradient(name)) for name in ("mujoco", "mjx")]  # pyright: ignore
+    systems = [SceneSystem(scene=scene, num_substeps=2, contact=gradient(name)) for name in ("mujoco", "mjx")]
     given = (jnp.array([0.1, 1.0]), jnp.array([0.5]), jax.random.key(0))
     jax.tree.map(
         lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), *(Exact().linear_model(s, *given) for s in systems)
