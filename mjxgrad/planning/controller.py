@@ -29,7 +29,7 @@ class Controller(Printed):
     made. `print` shows the rate and the missed deadlines.
 
     Attributes:
-        cost: cost of plans; to replace it by one with other arrays, such as a moved goal, compiles nothing.
+        cost: cost of plans; to replace it by one with other numbers, such as a moved goal, compiles nothing.
         deadline: time of a decision (s), or None.
         seconds: durations of the decisions since the last reset (s).
         num_missed: number of decisions that the deadline cut short, or that ended after it.
@@ -79,9 +79,9 @@ class Controller(Printed):
         start, _, *limits = given[0]
         problem = Problem(system, cost, smoother, jax.random.split(jax.random.key(0), len(start)), *limits)
         self.system, self.cost, self.deadline, self._none = system, cost, deadline, problem.begin(origin, start)
-        self._iterate, self._search = _compiled(problem), self._none
-        self._advance(self._origin, *self._schedules[0][[0, 0]], begins=True)
-        self.compile_seconds = time.perf_counter() - began
+        numbers, one = eqx.filter(cost, eqx.is_inexact_array_like), self._schedules[0][0]
+        lowered = jax.jit(_iteration(problem)).lower(numbers, self._none, self._origin, *_inputs(one, one))
+        self._iterate, self.compile_seconds = lowered.compile(), time.perf_counter() - began
         self.reset()
 
     def reset(self) -> None:
@@ -106,24 +106,21 @@ class Controller(Printed):
         start, is_first = self._vector(state), not self.seconds
         limit = np.inf if self.deadline is None or is_first else self.deadline
         factors, began, is_cut = self._schedules[0 if is_first else 1], time.perf_counter(), False
-        self._advance(start, factors[0], factors[0], begins=True, num_steps=0 if is_first else 1)
+        self._advance(start, *_inputs(factors[0], factors[0], begins=True, num_steps=0 if is_first else 1))
         for factor, following in itertools.pairwise([*factors, factors[-1]]):
             before = time.perf_counter()
             # An iteration is expected to last as long as the one before it.
             if is_cut := before - began + self._expected > limit:
                 break
-            self._advance(start, factor, following)
+            self._advance(start, *_inputs(factor, following))
             self._expected = time.perf_counter() - before
         self.seconds.append(time.perf_counter() - began)
         self.num_missed += is_cut or self.seconds[-1] > limit
         return np.array(self.plan.controls)[0]
 
-    def _advance(
-        self, start: np.ndarray, factor: Any, following: Any, *, begins: bool = False, num_steps: int = 0
-    ) -> None:
-        # NumPy's numbers: JAX would compile a program to make its own.
-        inputs = (start, factor, following, np.bool_(begins), np.int32(num_steps))
-        self._search = jax.block_until_ready(self._iterate(self.cost, self._search, *inputs))
+    def _advance(self, start: np.ndarray, *inputs: np.generic) -> None:
+        numbers = eqx.filter(self.cost, eqx.is_inexact_array_like)
+        self._search = jax.block_until_ready(self._iterate(numbers, self._search, start, *inputs))
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
         parts = [getattr(state, name) for name in ("qpos", "qvel", "act")] if hasattr(state, "qpos") else [state]
@@ -140,12 +137,17 @@ class Controller(Printed):
         return f"{len(self.seconds)} decisions, {rate}{missed}; compiled once, in {self.compile_seconds:.1f} s"
 
 
-def _compiled(problem: Problem):
-    """Return a compiled iteration; the first one of a decision begins at the last plan, some steps later."""
+def _inputs(factor: Any, following: Any, *, begins: bool = False, num_steps: int = 0) -> tuple[np.generic, ...]:
+    """Return the last arguments of an iteration, as NumPy's numbers: JAX would compile a program to make its own."""
+    return factor, following, np.bool_(begins), np.int32(num_steps)
 
-    @eqx.filter_jit
-    def run(cost: Cost, search: Search, start, factor, following, begins, num_steps) -> Search:
-        one = dataclasses.replace(problem, cost=cost)
+
+def _iteration(problem: Problem):
+    """Return the program of an iteration; the first one of a decision begins at the last plan, some steps later."""
+    rest = eqx.filter(problem.cost, eqx.is_inexact_array_like, inverse=True)
+
+    def run(numbers: Cost, search: Search, start, factor, following, begins, num_steps) -> Search:
+        one = dataclasses.replace(problem, cost=eqx.combine(numbers, rest))
         fresh = one.begin(start, shifted(search.best, num_steps))
         search = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, search)
         return iterate(one, search, factor, following, begins)[0]
