@@ -34,12 +34,13 @@ def controller(made):
 
 
 def test_a_pole_stands_by_a_hundred_decisions_that_compile_nothing(compilations):
-    """From 0.4 rad in C MuJoCo, then in gymnasium; a decision is one call of gymnasium's step."""
+    """From 0.2 rad in C MuJoCo, then in gymnasium; a decision is one call of gymnasium's step."""
     env = gymnasium.make("InvertedPendulum-v5").unwrapped
     system = SceneSystem(scene=mg.load_scene(env.model), num_substeps=2)
-    balance = Controller(system, GoalCost(jnp.zeros(4), 1.0, 10.0, 0.01), jnp.zeros((15, 1)), deadline=100.0)
+    cost = GoalCost(jnp.zeros(4), jnp.array([1.0, 10.0, 0.1, 0.1]), 10.0, 0.01)
+    balance = Controller(system, cost, jnp.zeros((15, 1)), first_schedule=np.ones(10), deadline=100.0)
     data, num_programs = mujoco.MjData(env.model), len(compilations)
-    data.qpos[1] = 0.4
+    data.qpos[1] = 0.2
     for _ in range(100):
         data.ctrl[:] = balance(data)
         mujoco.mj_step(env.model, data, 2)
@@ -88,11 +89,11 @@ def test_a_moved_goal_is_planned_for_and_compiles_nothing(controller, compilatio
 
 @pytest.mark.parametrize("gradient", [mg.Discrete, mg.Slope])
 def test_a_scene_is_planned_by_c_mujoco_as_by_mjx(gradient):
-    """A ball in air, two steps of 10 ms: the end, and its linear model."""
+    """A ball on a spring, two steps: the end, and its linear model up to the rounding of C's differences."""
     ball = "<worldbody><body><joint type='slide' name='x' stiffness='50'/><geom size='.1'/></body></worldbody>"
     scene = mg.load_scene(f"<mujoco>{ball}<actuator><motor joint='x'/></actuator></mujoco>")
     systems = [SceneSystem(scene=scene, num_substeps=2, contact=gradient(name)) for name in ("mujoco", "mjx")]
     given = (jnp.array([0.1, 1.0]), jnp.array([0.5]), jax.random.key(0))
     jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), *(Exact().linear_model(s, *given) for s in systems)
+        lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5), *(Exact().linear_model(s, *given) for s in systems)
     )
