@@ -58,7 +58,7 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            deadline: the time of a decision (s); the course of the shifted plan is computed at least.
+            deadline: the time of a decision (s); one iteration is taken at least.
             lower: lower limits of the controls.
             upper: upper limits of the controls.
 
@@ -106,13 +106,14 @@ class Controller(Printed):
         start, is_first = self._vector(state), not self.seconds
         limit = np.inf if self.deadline is None or is_first else self.deadline
         factors, began, is_cut = self._schedules[0 if is_first else 1], time.perf_counter(), False
-        self._advance(start, *_inputs(factors[0], factors[0], begins=True, num_steps=0 if is_first else 1))
-        for factor, following in itertools.pairwise([*factors, factors[-1]]):
+        if is_first:
+            self._advance(start, *_inputs(factors[0], factors[0], is_first=True))
+        for number, (factor, following) in enumerate(itertools.pairwise([*factors, factors[-1]])):
             before = time.perf_counter()
             # An iteration is expected to last as long as the one before it.
-            if is_cut := before - began + self._expected > limit:
+            if is_cut := number > 0 and before - began + self._expected > limit:
                 break
-            self._advance(start, *_inputs(factor, following))
+            self._advance(start, *_inputs(factor, following, is_shifted=number == 0 and not is_first))
             self._expected = time.perf_counter() - before
         self.seconds.append(time.perf_counter() - began)
         self.num_missed += is_cut or self.seconds[-1] > limit
@@ -137,19 +138,23 @@ class Controller(Printed):
         return f"{len(self.seconds)} decisions, {rate}{missed}; compiled once, in {self.compile_seconds:.1f} s"
 
 
-def _inputs(factor: Any, following: Any, *, begins: bool = False, num_steps: int = 0) -> tuple[np.generic, ...]:
+def _inputs(factor: Any, following: Any, *, is_first: bool = False, is_shifted: bool = False) -> tuple[np.generic, ...]:
     """Return the last arguments of an iteration, as NumPy's numbers: JAX would compile a program to make its own."""
-    return factor, following, np.bool_(begins), np.int32(num_steps)
+    return factor, following, np.bool_(is_first), np.bool_(is_shifted)
 
 
 def _iteration(problem: Problem):
-    """Return the program of an iteration; the first one of a decision begins at the last plan, some steps later."""
+    """Return the program of an iteration: of given controls the first, which computes their course, or of a shifted plan."""
     rest = eqx.filter(problem.cost, eqx.is_inexact_array_like, inverse=True)
 
-    def run(numbers: Cost, search: Search, start, factor, following, begins, num_steps) -> Search:
-        one = dataclasses.replace(problem, cost=eqx.combine(numbers, rest))
-        fresh = one.begin(start, shifted(search.best, num_steps))
-        search = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, search)
-        return iterate(one, search, factor, following, begins)[0]
+    def run(numbers: Cost, search: Search, start, factor, following, is_first, is_shifted) -> Search:
+        one, plan = dataclasses.replace(problem, cost=eqx.combine(numbers, rest)), search.best
+        fresh = one.begin(start, shifted(plan, jnp.where(is_shifted, 1, 0)))
+        # The new course of the shifted plan is not computed: the feedback law around the old one takes the difference.
+        states = jnp.concatenate([start[None], plan.states[2:], plan.states[-1:]])
+        course = Course(jnp.where(is_first, fresh.course.states, states), fresh.course.controls, fresh.course.cost)
+        fresh = dataclasses.replace(fresh, course=course)
+        search = jax.tree.map(lambda new, old: jnp.where(is_first | is_shifted, new, old), fresh, search)
+        return iterate(one, search, factor, following, is_first)[0]
 
     return run
