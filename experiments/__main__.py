@@ -26,6 +26,11 @@ for _name, _help in {
 }.items():
     app.command(f"experiments.benchmarks:{_name}", name=_name, help=_help)
 app.command(
+    "experiments.receding_horizon:rates",
+    name="rates",
+    help="Measure how often a robot can be planned for, beside a plain iLQR.",
+)
+app.command(
     "experiments.identification_bench:identify",
     name="identify-bench",
     help="Measure identification against mujoco.sysid.",

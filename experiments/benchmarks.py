@@ -43,14 +43,14 @@ from experiments.parallel import num_cores
 from mjxgrad._mjx import mjx
 from mjxgrad.tasks import scene_path
 
-_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _SCENES = {
     "two_bodies": scene_path("two_bodies"),
-    "hopper": _ASSETS / "hopper.xml",
-    "half_cheetah": _ASSETS / "half_cheetah.xml",
-    "ant": _ASSETS / "ant.xml",
+    "hopper": ASSETS / "hopper.xml",
+    "half_cheetah": ASSETS / "half_cheetah.xml",
+    "ant": ASSETS / "ant.xml",
     "quadruped": scene_path("quadruped"),
-    "humanoid": _ASSETS / "humanoid.xml",
+    "humanoid": ASSETS / "humanoid.xml",
 }
 # Of `bench`: contacts that a state has room for, where that is faster; in these motions no more ever act.
 _ROOM = {"ant": 8, "quadruped": 8, "humanoid": 12}

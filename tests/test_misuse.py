@@ -87,6 +87,11 @@ def sampled(**how):
     return planning.Sampled(**given | how).linear_model(system, jnp.zeros(2), jnp.zeros(2), key)
 
 
+def decided(state=(0.0, 0.0), **how):
+    given = {"controls": np.zeros((3, 2))} | how
+    return planning.Controller(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), **given)(np.array(state))
+
+
 five, wrong = np.zeros(5), np.zeros((3, 1))
 
 
@@ -257,6 +262,10 @@ FOUND = {
     "planned(schedule=np.array([1.0, 0.0]))": "schedule must be positive, got 0: for no smoothing take Exact()",
     "planned(lower=1.0, upper=0.0)": "lower must be at most upper",
     "planned(controls=np.zeros((3, 1)))": "controls must have shape (3, 2)",
+    "decided(deadline=0.0)": "deadline must be positive, in seconds, or None, got 0.0",
+    "decided(schedule=[])": "schedule must be one factor per iteration",
+    "decided(state=(0.0, 0.0, 0.0))": "state must have shape (2,) in this system, got (3,)",
+    "decided(state=(0.0, np.nan))": "state must be finite, got [0.0, nan]",
     "sampled(stddev_state=-1.0)": "stddev_state must be at least 0",
     "sampled(stddev_control=jnp.ones(3))": "stddev_control must be a number or have shape",
     "sampled(num_samples=4)": "num_samples must be at least 6",

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.native.engine import Engine, engine_of
 from mjxgrad.scene import Scene
-from mjxgrad.scene.scene import numbers_of
+from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
 
 _Arrays = Mapping[str, Array]
@@ -52,7 +52,10 @@ def roll_out(
         by_number, by_start, by_input = tangents
         given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
         before = {k: jnp.concatenate([start[k][None], found[k][:-1]]) for k in found}
-        before["time"] = start["time"] + numbers["opt.timestep"] * jnp.arange(horizon, dtype=dtype)[:, None]
+        before["time"] = (
+            start["time"]
+            + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
+        )
         jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs)
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():
@@ -73,14 +76,14 @@ def roll_out(
         parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])
         return found, dict(zip(("qpos", "qvel", "act"), parts, strict=True))
 
-    found = call(numbers_of(scene.model), start, inputs)
+    found = call(changed_numbers(scene), start, inputs)
     return found["qpos"], found["qvel"], found["act"]
 
 
 def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
     """Return the Jacobians of one step by "state" and "ctrl", and those of its sensors, "C" and "D"; see `roll_out`."""
     before = {name: x[None] for name, x in start.items()}
-    found = _jacobians(engine_of(scene.mj_model), gradient, ("ctrl", "C", "D"), numbers_of(scene.model), before, inputs)
+    found = _jacobians(engine_of(scene.mj_model), gradient, ("ctrl", "C", "D"), changed_numbers(scene), before, inputs)
     return {name: value[0] for name, value in found.items()}
 
 

@@ -48,6 +48,10 @@ class Engine:
         self.pool, self.threads = mujoco.rollout.Rollout(nthread=_NUM_THREADS), ThreadPoolExecutor(_NUM_THREADS)
         self.data = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
         self.start = mujoco.MjData(mj_model)
+        self.plain = copy.deepcopy(mj_model)
+        # A state that is not finite stays so, and is seen.
+        self.plain.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.kept = ({}, self.plain)  # the last numbers that all of a batch shared, and their model
         self.levers = levers_of(mj_model)
         bits = {name: getattr(_STATE, f"mjSTATE_{name.upper()}").value for name in (*START, "warmstart", *INPUTS)}
         begins = {name: mujoco.mj_stateSize(mj_model, _ALL & (bit - 1)) for name, bit in bits.items()}
@@ -150,9 +154,11 @@ class Engine:
             return np.broadcast_to(x, batch + x.shape[ndim:]).reshape(math.prod(batch), *x.shape[ndim:])
 
         varied = {name: flat(x) for name, x in values.items() if math.prod(x.shape[:ndim]) > 1}
-        base = with_numbers(self.mj_model, {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied})
-        # A state that is not finite stays so, and is seen.
-        base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        shared = {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied}
+        content = {k: x.tobytes() for k, x in shared.items()}
+        if content != self.kept[0]:
+            self.kept = (content, with_numbers(self.plain, shared))
+        base = self.kept[1]
         models = [base] * math.prod(batch)
         if varied:
             models = [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(len(models))]

@@ -1,11 +1,13 @@
-"""Planning through contact: trajectory optimisation on smoothed linear models."""
+"""Planning through contact: trajectory optimisation on smoothed linear models, and control by it."""
 
+from mjxgrad.planning.controller import Controller
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
 
 __all__ = [
     "Analytic",
+    "Controller",
     "Cost",
     "Exact",
     "FunctionSystem",

@@ -11,13 +11,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import whole
+from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.native import roll_out
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
+from mjxgrad.rollouts.arguments import arguments_of, native_motion
 from mjxgrad.rollouts.state import check_scene, data_of, state_of
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete, check_contact, step
@@ -37,6 +40,11 @@ class System(eqx.Module):
 
     num_changes: eqx.AbstractVar[int]
     num_controls: eqx.AbstractVar[int]
+
+    @property
+    def origin(self) -> StateVector:
+        """A state: zeros, or the reference pose of a scene at rest."""
+        return jnp.zeros(self.num_changes)
 
     @abstractmethod
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
@@ -59,16 +67,6 @@ class System(eqx.Module):
         """The least and the largest control; infinite where there is no limit."""
         unlimited = jnp.full(self.num_controls, jnp.inf)
         return -unlimited, unlimited
-
-    def limits(
-        self, lower: ArrayLike | None, upper: ArrayLike | None, dtype: jnp.dtype
-    ) -> tuple[ControlVector, ControlVector]:
-        """Return given limits (a number, or one per control) for each control; None takes `control_limits`."""
-        low, high = (
-            jnp.broadcast_to(jnp.asarray(own if given is None else given, dtype), (self.num_controls,))
-            for given, own in zip((lower, upper), self.control_limits, strict=True)
-        )
-        return low, high
 
     def with_contact(self, contact: Contact) -> "System":
         """Return the system with its contacts stepped otherwise, such as smoothed.
@@ -117,6 +115,10 @@ class SceneSystem(System):
         return 2 * self.scene.model.nv + self.scene.model.na
 
     @property
+    def origin(self) -> StateVector:
+        return self.flatten(self.scene.data)
+
+    @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.scene.model.nu
 
@@ -127,7 +129,7 @@ class SceneSystem(System):
         is_limited, ranges = np.asarray(model.actuator_ctrllimited, bool), model.actuator_ctrlrange
         return jnp.where(is_limited, ranges[:, 0], -jnp.inf), jnp.where(is_limited, ranges[:, 1], jnp.inf)
 
-    def flatten(self, state: State) -> StateVector:
+    def flatten(self, state: State | mjx.Data) -> StateVector:
         """Return a rollout's state as a vector, without time and warm start."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
@@ -140,6 +142,11 @@ class SceneSystem(System):
         nq, nv = self.scene.model.nq, self.scene.model.nv
         qvel = state[nq : nq + nv]
         start = State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
+        native = native_motion(self.scene, self.contact)
+        if native is not None:
+            begin, resting = arguments_of(self.scene, start)
+            inputs = jax.tree.map(lambda x: jnp.stack([x] * self.num_substeps), resting | {"ctrl": control})
+            return jnp.concatenate([x[-1] for x in roll_out(self.scene, begin, inputs, native.gradient)])
 
         def advance(now: State, _: None) -> tuple[State, None]:
             data = data_of(self.scene, now, control)

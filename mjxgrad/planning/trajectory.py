@@ -1,5 +1,6 @@
 """Trajectory optimisation on smoothed linear models, whose smoothing decreases as the plan improves."""
 
+import functools
 import warnings
 
 import equinox as eqx
@@ -9,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad._arrays import instance, known, one_key
-from mjxgrad._programs import compiled, is_traced
+from mjxgrad._programs import compiled
 from mjxgrad._text import Printed, format_number
-from mjxgrad.planning.linear_model import LinearModel, Smoother
+from mjxgrad.planning.linear_model import Analytic, LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 from mjxgrad.rollouts.arguments import sequence_of
 
@@ -104,7 +105,7 @@ class Feedback(eqx.Module):
     is_sound: Bool[Array, ""]
 
 
-class _Course(eqx.Module):
+class Course(eqx.Module):
     """A trajectory, its controls and its cost."""
 
     states: Float[Array, "states state"]
@@ -112,7 +113,16 @@ class _Course(eqx.Module):
     cost: _Scalar
 
 
-class _Problem(eqx.Module):
+class Search(eqx.Module):
+    """The state of the search between iterations: its course, the best one without smoothing, and the unmoved coordinates."""
+
+    course: Course
+    best: Course
+    regularisation: _Scalar
+    unmoved: Bool[Array, " n"]
+
+
+class Problem(eqx.Module):
     """The constants of all iterations."""
 
     system: System
@@ -122,7 +132,15 @@ class _Problem(eqx.Module):
     lower: ControlVector
     upper: ControlVector
 
-    def run(self, smoother: Smoother | None, course: _Course, law: Feedback, step: ArrayLike) -> _Course:
+    def begin(self, start: StateVector, controls: _Controls) -> Search:
+        """Return the search before its first iteration."""
+        at_start = jnp.broadcast_to(start, (len(controls) + 1, *start.shape))
+        unknown = jnp.asarray(jnp.inf, start.dtype)
+        given = Course(at_start, jnp.clip(controls, self.lower, self.upper), unknown)
+        least = jnp.asarray(_LEAST_REGULARISATION, start.dtype)
+        return Search(given, given, least, jnp.zeros(self.system.num_changes, bool))
+
+    def run(self, smoother: Smoother | None, course: Course, law: Feedback, step: ArrayLike) -> Course:
         """Follow a course under a feedback law; a step of zero repeats its controls."""
         follows = jnp.asarray(step) > 0
 
@@ -139,9 +157,9 @@ class _Problem(eqx.Module):
         final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
         states = jnp.concatenate([states, final[None]])
         cost = self.cost.total(self.system, states, controls)
-        return _Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
+        return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
-    def law(self, smoother: Smoother, course: _Course, regularisation: _Scalar):
+    def law(self, smoother: Smoother, course: Course, regularisation: _Scalar):
         """Return the feedback law around a course, and the unmoved coordinates."""
         system, cost, states, controls = self.system, self.cost, course.states, course.controls
         models = jax.vmap(lambda *at: smoother.linear_model(system, *at))(states[:-1], controls, self.keys)
@@ -197,12 +215,28 @@ def optimise_trajectory(
     """
     one_key(key)
     instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
-    start, controls = jnp.asarray(start), jnp.asarray(controls)
-    factors = jnp.asarray(schedule, start.dtype)
-    lower, upper = system.limits(lower, upper, start.dtype)
+    start = jnp.asarray(start)
     for message in smoother.warnings(system, start):
         warnings.warn(message, stacklevel=2)
+    controls, factors, *limits = checked(system, start, controls, schedule, lower, upper)
+    problem = Problem(system, cost, smoother, jax.random.split(key, len(controls)), *limits)
+    return _improved(problem, start, controls, factors)
+
+
+def checked(
+    system: System,
+    start: Array,
+    controls: ArrayLike,
+    schedule: ArrayLike,
+    lower: ArrayLike | None,
+    upper: ArrayLike | None,
+) -> tuple[_Controls, Float[Array, " iterations"], ControlVector, ControlVector]:
+    """Return controls, schedule and limits of `optimise_trajectory` as arrays; refuse those that do not fit."""
     sequence_of(controls, None, None, system.num_controls)
+    dtype, shape, own = start.dtype, (system.num_controls,), system.control_limits
+    controls, factors = jnp.asarray(controls, dtype), jnp.asarray(schedule, dtype)
+    lower = jnp.broadcast_to(jnp.asarray(own[0] if lower is None else lower, dtype), shape)
+    upper = jnp.broadcast_to(jnp.asarray(own[1] if upper is None else upper, dtype), shape)
     if factors.ndim != 1 or not factors.size:
         raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
     given, low, high = known(factors), known(lower), known(upper)
@@ -210,61 +244,66 @@ def optimise_trajectory(
         raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
     if low is not None and high is not None and not (low <= high).all():
         raise ValueError(f"lower must be at most upper, got {low} and {high}")
-    problem = _Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper)
-    return _improved(problem, start, controls, factors)
+    return controls, factors, lower, upper
 
 
 @compiled
-def _improved(problem: _Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
-    """Return the plan; its data are arguments, so that a receding horizon needs no new compilation."""
-    system, smoother, horizon = problem.system, problem.smoother, len(controls)
-    steps = jnp.array((0.0, *_STEPS), start.dtype)
-    at_start = jnp.broadcast_to(start, (horizon + 1, *start.shape))
-    given = _Course(at_start, jnp.clip(controls, problem.lower, problem.upper), jnp.asarray(jnp.inf, start.dtype))
-
-    def iterate(carry, inputs):
-        course, best, regularisation, *_ = carry
-        factor, following, is_first = inputs
-        law, unmoved = problem.law(smoother.scaled(factor), course, regularisation)
-        tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
-        index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
-        course = jax.tree.map(lambda x: x[index], tried)
-        true = problem.run(None, course, law, 0.0)
-        best = jax.tree.map(lambda new, old: jnp.where(is_first | (true.cost < best.cost), new, old), true, best)
-        # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
-        change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
-        after = jnp.clip(change * regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
-        after = jnp.where(is_first, regularisation, after)
-        row = Iterations(factor, course.cost, true.cost, steps[index], law.promised)
-        return (course, best, after, unmoved), row
-
+def _improved(problem: Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
+    """Return the plan; its data are arguments, so that to plan again needs no new compilation."""
     # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
     inputs = (present, following, jnp.arange(len(present)) == 0)
-    nothing = jnp.zeros(system.num_changes, bool)
-    carry = (given, given, jnp.asarray(_LEAST_REGULARISATION, start.dtype), nothing)
-    (course, best, _, unmoved), rows = jax.lax.scan(iterate, carry, inputs)
+    found, rows = jax.lax.scan(lambda search, at: iterate(problem, search, *at), problem.begin(start, controls), inputs)
     start_cost, rows = rows.cost[0], jax.tree.map(lambda x: x[1:], rows)
     return Plan(
-        controls=best.controls,
-        states=best.states,
+        controls=found.best.controls,
+        states=found.best.states,
         start_cost=start_cost,
-        cost=best.cost,
+        cost=found.best.cost,
         iterations=rows,
-        unmoved=unmoved,
-        converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(course.cost)) & ~unmoved.any(),
+        unmoved=found.unmoved,
+        converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(found.course.cost)) & ~found.unmoved.any(),
         diverged=~jnp.all(jnp.isfinite(rows.smoothed_cost)),
     )
 
 
-def shifted(plan: Plan, num_steps: int = 1) -> _Controls:
+def iterate(
+    problem: Problem, search: Search, factor: _Scalar, following: _Scalar, is_first: Bool[Array, ""]
+) -> tuple[Search, Iterations]:
+    """Take one iteration under a factor of the smoothing; the first one computes the course of the given controls alone."""
+    smoother, course, zeros = problem.smoother, search.course, functools.partial(jnp.zeros, dtype=problem.lower.dtype)
+    gains = (*course.controls.shape, problem.system.num_changes)
+    nothing = Feedback(zeros(course.controls.shape), zeros(gains), zeros(()), jnp.asarray(True))
+    law, unmoved = jax.lax.cond(
+        is_first,
+        lambda: (nothing, search.unmoved),
+        lambda: problem.law(smoother.scaled(factor), course, search.regularisation),
+    )
+    steps = jnp.array((0.0, *_STEPS), course.states.dtype)
+    tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
+    index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
+    course = jax.tree.map(lambda x: x[index], tried)
+    is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None
+    true = course if is_exact else problem.run(None, course, law, 0.0)
+    is_better = is_first | (true.cost < search.best.cost)
+    best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
+    # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
+    change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
+    after = jnp.clip(change * search.regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
+    after = jnp.where(is_first, search.regularisation, after)
+    row = Iterations(factor, course.cost, true.cost, steps[index], law.promised)
+    return Search(course, best, after, unmoved), row
+
+
+def shifted(plan: Plan | Course, num_steps: ArrayLike = 1) -> _Controls:
     """Return the controls of a plan some steps later, the last one held, as the next start of a receding horizon.
 
     Args:
         plan: the plan, whose first steps were taken.
         num_steps: number of steps taken.
     """
-    return plan.controls[np.minimum(np.arange(len(plan.controls)) + num_steps, len(plan.controls) - 1)]
+    last = len(plan.controls) - 1
+    return plan.controls[jnp.minimum(jnp.arange(last + 1) + num_steps, last)]
 
 
 def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: _Scalar) -> Bool[Array, " n"]:

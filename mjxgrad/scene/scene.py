@@ -203,6 +203,17 @@ def numbers_of(model: mjx.Model) -> dict[str, Array]:
     return {k: v for k, v in every.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)}
 
 
+def changed_numbers(scene: "Scene") -> dict[str, Array]:
+    """Return the numbers of a scene's model that its C model does not have, or that are not known yet."""
+
+    def is_changed(name: str, value: Array) -> bool:
+        holder = scene.mj_model.opt if name.startswith("opt.") else scene.mj_model
+        given = np.asarray(getattr(holder, name.removeprefix("opt."), value))
+        return not is_known(value) or not np.array_equal(np.ravel(value), np.ravel(given).astype(value.dtype))
+
+    return {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)}
+
+
 _PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "body_iquat")
 
 

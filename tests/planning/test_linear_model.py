@@ -12,6 +12,7 @@ import mjxgrad as mg
 from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.planning.linear_model import Analytic, Exact, Sampled
 from mjxgrad.planning.system import FunctionSystem, SceneSystem
+from mjxgrad.planning.trajectory import checked
 from mjxgrad.stepping import Smoothing, own_motion
 
 A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
@@ -180,8 +181,9 @@ def test_a_ball_on_a_spring_is_found_without_error_by_all_three(key, gradient):
 def test_limits_are_those_of_the_actuators_unless_others_are_given():
     ranged = SPRING.replace('<motor joint="x"/>', '<motor joint="x"/><motor joint="x" ctrlrange="-2 3"/>')
     system = SceneSystem(mg.load_scene(ranged))
-    np.testing.assert_array_equal(system.limits(None, None, np.dtype(float)), [[-np.inf, -2], [np.inf, 3]])
-    np.testing.assert_array_equal(system.limits(-1.0, None, np.dtype(float)), [[-1, -1], [np.inf, 3]])
+    given = (system, system.origin, np.zeros((1, 2)), np.ones(1))
+    np.testing.assert_array_equal(checked(*given, None, None)[2:], [[-np.inf, -2], [np.inf, 3]])
+    np.testing.assert_array_equal(checked(*given, -1.0, None)[2:], [[-1, -1], [np.inf, 3]])
 
 
 RAILS = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
