@@ -52,7 +52,7 @@ class Products(eqx.Module):
     def with_more(self, first: Halves, zeroth: Halves) -> "Products":
         """Return the products with those of one more update; one that is not finite is left out."""
         dot = optax.tree.vdot
-        total = sum(dot(half, half) for half in (*first, *zeroth))
+        total = jnp.asarray(sum(dot(half, half) for half in (*first, *zeroth)))
         is_sound = jnp.isfinite(total) & (total > 0)
         new = (
             4 * dot(*first),
