@@ -208,8 +208,9 @@ class ActorCritic(Method):
 
         first, zeroth = halves(shortened.sound.first), halves(shortened.zeroth)
         products = learner.products.with_more(first, zeroth)
-        alpha = products.weight() if self.settings.alpha is None else jnp.asarray(self.settings.alpha)
-        mixed = jax.tree.map(lambda d, z: alpha * d + (1 - alpha) * z, first, zeroth)
+        alpha = self.settings.alpha
+        a, b = products.weights() if alpha is None else (jnp.asarray(alpha), jnp.asarray(1 - alpha))
+        mixed = jax.tree.map(lambda d, z: a * d + b * z, first, zeroth)
         gradient = optax.tree.add(*mixed)
         norm = optax.tree.norm(gradient)
         is_finite = jnp.isfinite(norm)
@@ -219,7 +220,7 @@ class ActorCritic(Method):
             lambda x, y: jnp.where(is_finite, x, y), new, (policy.actor, learner.actor_moments)
         )
         found = {
-            "alpha": alpha,
+            "alpha": a / jnp.where(a + b > 0, a + b, 1.0),
             "gradient_norm": norm,
             "agreement": optax.tree.vdot(*mixed) / math.prod(map(optax.tree.norm, mixed)),
             "cosine": products.cosine,

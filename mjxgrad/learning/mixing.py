@@ -5,24 +5,31 @@ first order as $d$, with little noise, wrong in the mean where contacts jump. Of
 expected squared error has
 $$\begin{pmatrix} |\bar d|^2 + V^1 & \bar d \cdot g \\ \bar d \cdot g & |g|^2 + V^0 \end{pmatrix}
 \begin{pmatrix} a \\ b \end{pmatrix} = \begin{pmatrix} \bar d \cdot g \\ |g|^2 \end{pmatrix},$$
-with the noises' traces $V^1$ and $V^0$. Its direction is $\alpha d + (1 - \alpha) z$ with $\alpha = a/(a + b)$, and the
-optimiser takes care of its length. Where $\bar d = g$ this weighs by inverse variance. Where $d$ points at no good,
-$\bar d \cdot g \le 0$, $\alpha$ is 0; so no bias holds a policy where the return still rises.
+with the noises' traces $V^1$ and $V^0$, and $\alpha = a/(a + b)$; the optimiser takes care of the length. Where $\bar d = g$ this weighs by inverse variance. Where $d$
+points at no good, $\bar d \cdot g \le 0$, $\alpha$ is 0; so no bias holds a policy where the return still rises.
 
 All products are known without bias from the gradients of two halves of the environments: products across halves have no
-noise, and half the difference of halves has the mean's. A batch knows them roughly, the last twenty updates well.
+noise, and half the difference of halves has the mean's. A batch knows them roughly, the last twenty updates better. What
+they leave open is taken in favour of first order: $|g|^2$ is less two standard errors, $\bar d \cdot g$ more two. In a few
+environments, where zeroth order is noise, no bias can then be seen, and $\alpha$ is 1.
 
 References:
     Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators. Journal of the
     American Statistical Association 86, 1991, for weights from such products that sum to one.
 """
 
+import dataclasses
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PyTree
 
 _MEMORY = 0.95  # share of what was known before that stays
+_ERRORS = (
+    2 * ((1 - _MEMORY) / (1 + _MEMORY)) ** 0.5
+)  # two standard errors of such a mean, over the deviation of one update
 Halves = tuple[PyTree, PyTree]
 """The parts of a mean gradient that come from either half of the environments."""
 
@@ -36,6 +43,9 @@ class Products(eqx.Module):
         zeroth: $|g|^2$.
         zeroth_noise: $V^0$, that of zeroth order.
         across: $\bar d \cdot g$.
+        zeroth_spread: variance of an update's `zeroth`, half the squared change from the update before.
+        across_spread: that of `across`.
+        last: the last update's `zeroth` and `across`.
     """
 
     first: Float[Array, ""]
@@ -43,38 +53,42 @@ class Products(eqx.Module):
     zeroth: Float[Array, ""]
     zeroth_noise: Float[Array, ""]
     across: Float[Array, ""]
+    zeroth_spread: Float[Array, ""]
+    across_spread: Float[Array, ""]
+    last: Float[Array, "2"]
 
     @classmethod
     def none(cls) -> "Products":
         """Return the products of no update."""
-        return cls(*jnp.zeros(5))
+        return cls(*jnp.zeros(7), last=jnp.zeros(2))
 
     def with_more(self, first: Halves, zeroth: Halves) -> "Products":
         """Return the products with those of one more update; one that is not finite is left out."""
         dot = optax.tree.vdot
         total = jnp.asarray(sum(dot(half, half) for half in (*first, *zeroth)))
         is_sound = jnp.isfinite(total) & (total > 0)
-        new = (
-            4 * dot(*first),
-            optax.tree.norm(optax.tree.sub(*first), squared=True),
-            4 * dot(*zeroth),
-            optax.tree.norm(optax.tree.sub(*zeroth), squared=True),
-            2 * (dot(first[0], zeroth[1]) + dot(first[1], zeroth[0])),
-        )
-        old = (self.first, self.first_noise, self.zeroth, self.zeroth_noise, self.across)
-        share = (1 - _MEMORY) / jnp.where(is_sound, total, 1.0)
-        return Products(*(jnp.where(is_sound, _MEMORY * x + share * y, x) for x, y in zip(old, new, strict=True)))
+        share = 1 / jnp.where(is_sound, total, 1.0)
+        own, shared = 4 * share * dot(*zeroth), 2 * share * (dot(first[0], zeroth[1]) + dot(first[1], zeroth[0]))
+        noises = (share * optax.tree.norm(optax.tree.sub(*halves), squared=True) for halves in (first, zeroth))
+        first_noise, zeroth_noise = noises
+        last = jnp.stack([own, shared])
+        # By changes between updates, for what drifts over many is no error.
+        spreads = (last - self.last) ** 2 / 2
+        new = Products(4 * share * dot(*first), first_noise, own, zeroth_noise, shared, *spreads, last)
+        means = jax.tree.map(lambda x, y: _MEMORY * x + (1 - _MEMORY) * y, self, new)
+        following = dataclasses.replace(means, last=last)
+        return jax.tree.map(lambda old, new: jnp.where(is_sound, new, old), self, following)
 
     @property
     def cosine(self) -> Float[Array, ""]:
         """Cosine between the means of both gradients; NaN where the noise hides one of them."""
         return self.across / jnp.sqrt(self.first * self.zeroth)
 
-    def weight(self) -> Float[Array, ""]:
-        """Return the weight of first order, from 0 to 1; 1 where zeroth order shows nothing but agrees."""
-        a = jnp.maximum(self.across * self.zeroth_noise, 0)
-        both = (jnp.maximum(self.first, 0) + self.first_noise) * jnp.maximum(self.zeroth, 0)
-        b = jnp.maximum(both - self.across**2, 0)
-        is_known = a + b > 0
-        alpha = jnp.where(is_known, a / jnp.where(is_known, a + b, 1.0), 1.0)
-        return jnp.where(self.across > 0, alpha, 0.0)
+    def weights(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return $a$ and $b$ over the larger of the two; 1 and 0 where zeroth order shows nothing against first order."""
+        zeroth = jnp.maximum(self.zeroth - _ERRORS * jnp.sqrt(self.zeroth_spread), 0)
+        across = jnp.maximum(self.across + _ERRORS * jnp.sqrt(self.across_spread), 0)
+        first = jnp.maximum(self.first, 0) + self.first_noise
+        a, b = across * self.zeroth_noise, jnp.maximum(first * zeroth - across**2, 0)
+        most = jnp.maximum(a, b)
+        return jnp.where(b > 0, a / jnp.where(b > 0, most, 1.0), 1.0), b / jnp.where(most > 0, most, 1.0)

@@ -14,8 +14,17 @@ from mjxgrad.learning.mixing import Products
 
 
 def products(first, gradient, first_noise, zeroth_noise):
-    numbers = first @ first, first_noise, gradient @ gradient, zeroth_noise, first @ gradient
-    return Products(*map(jnp.asarray, numbers))
+    """Products that are known for sure."""
+    own, across = gradient @ gradient, first @ gradient
+    known = map(jnp.asarray, (first @ first, first_noise, own, zeroth_noise, across, 0.0, 0.0))
+    return Products(*known, last=jnp.stack([own, across]))
+
+
+def share(found):
+    """α, of weights whose larger one is 1."""
+    a, b = found.weights()
+    assert max(a, b) == 1
+    return a / (a + b)
 
 
 def least_error(first, gradient, first_noise, zeroth_noise):
@@ -35,17 +44,24 @@ def test_no_other_weights_have_less_error(seed):
     random = np.random.default_rng(seed)
     means, noises = random.normal(size=(2, 3)), random.uniform(0.1, 3, 2)
     case = means[0], means[1], noises[0], noises[1]
-    assert_allclose(products(*case).weight(), least_error(*case), atol=2e-5)
+    assert_allclose(share(products(*case)), least_error(*case), atol=2e-5)
 
 
 def test_without_bias_it_weighs_by_inverse_variance_and_a_wrong_direction_counts_for_nothing():
     up, along = jnp.array([0.0, 1.0]), jnp.array([2.0, 0.0])
-    assert_allclose(products(along, along, 1.0, 3.0).weight(), 3 / 4)
-    assert products(up, along, 1e-6, 3.0).weight() == 0
-    assert products(-along, along, 1e-6, 3.0).weight() == 0
-    # Zeroth order shows nothing but noise, which agrees with first order.
-    hidden = products(along, along, 0.1, 5.0)
-    assert eqx.tree_at(lambda p: p.zeroth, hidden, -0.2).weight() == 1
+    assert_allclose(share(products(along, along, 1.0, 3.0)), 3 / 4)
+    assert share(products(up, along, 1e-6, 3.0)) == 0
+    assert share(products(-along, along, 1e-6, 3.0)) == 0
+
+
+def test_what_is_not_sure_counts_for_first_order():
+    """Two standard errors of a running mean, each the root of 0.05/1.95 of a deviation, hide a bias or an opposition."""
+    up, along = jnp.array([0.0, 1.0]), jnp.array([2.0, 0.0])
+    for biased, name in ((products(up, along, 0.1, 3.0), "zeroth"), (products(-along, along, 1e-6, 3.0), "across")):
+        for deviation, hides in ((3.3, True), (2.9, False)):
+            spread = (deviation * getattr(biased, name)) ** 2
+            found = eqx.tree_at(lambda p, n=f"{name}_spread": getattr(p, n), biased, spread)
+            assert (share(found) > 0) == hides
 
 
 def test_halves_tell_the_products_of_means_without_their_noise():
@@ -58,10 +74,10 @@ def test_halves_tell_the_products_of_means_without_their_noise():
         halves = [(mean + part) / 2 for mean, part in zip((first, first, gradient, gradient), noise, strict=True)]
         found = Products.none().with_more(tuple(halves[:2]), tuple(halves[2:]))
         total = sum((half**2).sum() for half in halves)
-        return jax.tree.map(lambda x: x * total / 0.05, found)
+        return [x * total / 0.05 for x in jax.tree.leaves(found)[:5]]
 
-    found = jax.tree.leaves(jax.vmap(draw)(keys))
-    wanted = jax.tree.leaves(products(first, gradient, 3 / 2, 27 / 2))
+    found = jax.vmap(draw)(keys)
+    wanted = jax.tree.leaves(products(first, gradient, 3 / 2, 27 / 2))[:5]
     for values, value in zip(found, wanted, strict=True):
         assert abs(values.mean() - value) < 4 * values.std() / len(keys) ** 0.5
 
@@ -69,9 +85,16 @@ def test_halves_tell_the_products_of_means_without_their_noise():
 def test_an_update_counts_for_a_twentieth_and_one_that_is_no_number_for_nothing():
     first, zeroth = (jnp.array([1.0, 0.0]), jnp.array([1.0, 0.0])), (jnp.array([1.0, 2.0]), jnp.array([1.0, -2.0]))
     once = Products.none().with_more(first, zeroth)
-    assert_allclose(jax.tree.leaves(once), 0.05 * np.array([4, 0, -12, 16, 4]) / 12)
-    assert_allclose(jax.tree.leaves(once.with_more(first, zeroth)), 1.95 * np.array(jax.tree.leaves(once)))
+    one = np.array([4, 0, -12, 16, 4]) / 12
+    numbers = [np.asarray(x) for x in jax.tree.leaves(once)]
+    assert_allclose(numbers[:5], 0.05 * one)
+    assert_allclose(numbers[5:7], 0.05 * np.array([1, 1 / 9]) / 2)
+    assert_allclose(numbers[7], [-1, 1 / 3])
+    twice = jax.tree.leaves(once.with_more(first, zeroth))
+    assert_allclose(twice[:5], 1.95 * 0.05 * one)
+    assert_allclose(twice[5:7], 0.95 * np.array(numbers[5:7]))  # nothing has changed
     for bad in itertools.product((jnp.nan, jnp.inf), (first, zeroth)):
-        broken = tuple(half.at[0].set(bad[0]) for half in bad[1])
+        broken = (bad[1][0].at[0].set(bad[0]), bad[1][1])
         parts = (broken, zeroth) if bad[1] is first else (first, broken)
-        assert_allclose(jax.tree.leaves(once.with_more(*parts)), jax.tree.leaves(once))
+        for x, y in zip(jax.tree.leaves(once.with_more(*parts)), numbers, strict=True):
+            assert_allclose(x, y)
