@@ -5,8 +5,9 @@ first order as $d$, with little noise, wrong in the mean where contacts jump. Of
 expected squared error has
 $$\begin{pmatrix} |\bar d|^2 + V^1 & \bar d \cdot g \\ \bar d \cdot g & |g|^2 + V^0 \end{pmatrix}
 \begin{pmatrix} a \\ b \end{pmatrix} = \begin{pmatrix} \bar d \cdot g \\ |g|^2 \end{pmatrix},$$
-with the noises' traces $V^1$ and $V^0$, and $\alpha = a/(a + b)$; the optimiser takes care of the length. Where $\bar d = g$ this weighs by inverse variance. Where $d$
-points at no good, $\bar d \cdot g \le 0$, $\alpha$ is 0; so no bias holds a policy where the return still rises.
+with the noises' traces $V^1$ and $V^0$, and $\alpha = a/(a + b)$; the optimiser takes care of the length. Where
+$\bar d = g$ this weighs by inverse variance. Where $d$ points at no good, $\bar d \cdot g \le 0$, $\alpha$ is 0; so no bias
+holds a policy where the return still rises.
 
 All products are known without bias from the gradients of two halves of the environments: products across halves have no
 noise, and half the difference of halves has the mean's. A batch knows them roughly, the last twenty updates better. What
