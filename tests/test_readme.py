@@ -114,7 +114,18 @@ def test_how_tos_run_and_do_their_job(number, tmp_path, monkeypatch):
     _CHECKS[number](names)
 
 
-_SHOWN = ("mg.check(scene, derivatives=False)", "result", "learned", "pusher", "balance", "", "", "result", "", "found.result")
+_SHOWN = (
+    "mg.check(scene, derivatives=False)",
+    "result",
+    "learned",
+    "pusher",
+    "balance",
+    "",
+    "",
+    "result",
+    "",
+    "found.result",
+)
 
 
 @pytest.mark.slow

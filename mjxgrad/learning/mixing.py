@@ -28,9 +28,8 @@ import optax
 from jaxtyping import Array, Float, PyTree
 
 _MEMORY = 0.95  # share of what was known before that stays
-_ERRORS = (
-    2 * ((1 - _MEMORY) / (1 + _MEMORY)) ** 0.5
-)  # two standard errors of such a mean, over the deviation of one update
+# Two standard errors of such a mean, over the deviation of one update.
+_ERRORS = 2 * ((1 - _MEMORY) / (1 + _MEMORY)) ** 0.5
 Halves = tuple[PyTree, PyTree]
 """The parts of a mean gradient that come from either half of the environments."""
 
