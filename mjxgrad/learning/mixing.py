@@ -44,7 +44,7 @@ class Products(eqx.Module):
         zeroth_noise: $V^0$, that of zeroth order.
         across: $\bar d \cdot g$.
         zeroth_spread: variance of an update's `zeroth`, half the squared change from the update before.
-        across_spread: that of `across`.
+        across_spread: variance of an update's `across`.
         last: the last update's `zeroth` and `across`.
     """
 
