@@ -73,8 +73,8 @@ class Products(eqx.Module):
         first_noise, zeroth_noise = noises
         last = jnp.stack([own, shared])
         # By changes between updates, for what drifts over many is no error.
-        spreads = (last - self.last) ** 2 / 2
-        new = Products(4 * share * dot(*first), first_noise, own, zeroth_noise, shared, *spreads, last)
+        spread = (last - self.last) ** 2 / 2
+        new = Products(4 * share * dot(*first), first_noise, own, zeroth_noise, shared, spread[0], spread[1], last)
         means = jax.tree.map(lambda x, y: _MEMORY * x + (1 - _MEMORY) * y, self, new)
         following = dataclasses.replace(means, last=last)
         return jax.tree.map(lambda old, new: jnp.where(is_sound, new, old), self, following)
