@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 
 from mjxgrad._arrays import instance, known, one_key
-from mjxgrad._programs import compiled
+from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model

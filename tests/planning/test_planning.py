@@ -171,6 +171,10 @@ def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves(pushi
     assert plan.unmoved.tolist() == [False, True]
     assert not plan.converged
     assert plan.verdict().startswith("nothing is touched: no control moves the coordinates [1]")
+    assert (
+        str(plan)
+        == f"Cost {plan.cost:.3g} from {plan.start_cost:.3g} in {plan.iterations.cost.size} iterations: {plan.verdict()}."
+    )
 
 
 def test_a_plan_is_the_rollout_of_its_controls(pushing):
