@@ -17,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
-.PHONY: help setup demo test test-slow mujoco4 bench throughput engines costs rates identify-bench robots gallery docs lint clean $(EXPERIMENTS)
+.PHONY: help setup demo test test-slow mujoco4 bench throughput engines costs rates gradient_audit identify-bench robots gallery docs lint clean $(EXPERIMENTS)
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -72,6 +72,9 @@ costs: .venv/.installed  ## measure what onset, event gradient and smoothing cos
 
 rates: .venv/.installed  ## measure how often a robot can be planned for, beside a plain iLQR
 	@$(BIN)/python -m experiments rates $(ARGS)
+
+gradient_audit: .venv/.installed  ## measure along which gradients of a policy its return rises
+	@$(BIN)/python -m experiments gradient-audit $(ARGS)
 
 identify-bench: .venv/.installed  ## measure identification against mujoco.sysid, answers included
 	@$(BIN)/python -m experiments identify-bench $(ARGS)

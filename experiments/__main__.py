@@ -31,6 +31,11 @@ app.command(
     help="Measure how often a robot can be planned for, beside a plain iLQR.",
 )
 app.command(
+    "experiments.gradient_audit:gradient_audit",
+    name="gradient-audit",
+    help="Measure along which gradients of a policy its return rises.",
+)
+app.command(
     "experiments.identification_bench:identify",
     name="identify-bench",
     help="Measure identification against mujoco.sysid.",

@@ -203,7 +203,7 @@ def _courses(
 ) -> list[Course]:
     """Learn by one method: at every stiffness side by side, in one program, but for PPO."""
     factors, num_updates = settings.stiffness, settings.sizes.num_updates
-    environments = [environment if k == 1 else environment.with_softness(_stiffer(environment, k)) for k in factors]
+    environments = [environment if k == 1 else environment.with_softness(stiffer(environment, k)) for k in factors]
     if method == "ppo":
         learned = [
             _by_ppo(settings, one, lambda done, i=i: advance_to((i * num_updates + done) // len(factors)))
@@ -319,7 +319,7 @@ def _stepped(environment: Environment, method: Method) -> Environment:
     return environment.with_contact({"onset": mg.Onset(), "slope": mg.Slope()}.get(method, mg.Discrete()))
 
 
-def _stiffer(environment: Environment, factor: float) -> mg.Softness:
+def stiffer(environment: Environment, factor: float) -> mg.Softness:
     """Return contact that is stiffer, with the same damping ratio."""
     parameters = environment.scene.contact_parameters()
     return mg.Softness(

@@ -58,6 +58,12 @@ class Quadruped(Environment):
         posture = state.qpos[7:] - self.scene.data.qpos[7:]
         return jnp.concatenate([turning, down, memory["command"], posture, 0.1 * state.qvel[6:], memory["action"]])
 
+    def privileged(self, state: State, memory: Memory) -> Float[Array, " 7"]:
+        """Return speed and height, which the rewards are about, the next push, and the friction."""
+        return jnp.concatenate(
+            [_in_trunk(state)[1], state.qpos[2:3], memory["push"], self.scene.model.geom_friction[:1, 0]]
+        )
+
     def rewards(
         self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
     ) -> dict[str, Float[Array, ""]]:

@@ -31,6 +31,7 @@ class EnvState(eqx.Module):
     Attributes:
         physics: positions, velocities and activations.
         obs: observation of the policy.
+        privileged: further input of the value function, see `Environment.privileged`.
         reward: reward of the last step.
         terminated: whether the episode ended for good: a fall, an arrival, or a state that is not finite.
         truncated: whether only the time was up. A value function continues beyond such an end.
@@ -42,6 +43,7 @@ class EnvState(eqx.Module):
 
     physics: State
     obs: Float[Array, " obs"]
+    privileged: Float[Array, " privileged"]
     reward: Float[Array, ""]
     terminated: Bool[Array, ""]
     truncated: Bool[Array, ""]
@@ -49,6 +51,11 @@ class EnvState(eqx.Module):
     num_steps: Int[Array, ""]
     memory: PyTree
     key: PRNGKeyArray
+
+    @property
+    def seen(self) -> Float[Array, "*batch seen"]:
+        """Input of the value function: the observation, and what is privileged behind it."""
+        return jnp.concatenate([self.obs, self.privileged], axis=-1)
 
     @property
     def done(self) -> Bool[Array, "*batch"]:
@@ -82,6 +89,10 @@ class Environment(InScene):
     @abstractmethod
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
         """Return the observation of the policy."""
+
+    def privileged(self, state: State, memory: PyTree) -> Float[Array, " privileged"]:
+        """Return what the value function sees besides while learning, such as a speed that the robot cannot measure."""
+        return jnp.zeros(0, state.qpos.dtype)
 
     @abstractmethod
     def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
@@ -148,7 +159,8 @@ class Environment(InScene):
         terms = jax.eval_shape(lambda: self.rewards(physics, action, physics, memory))
         zero, no = jnp.zeros((), obs.dtype), jnp.array(False)
         metrics = dict.fromkeys([*terms, "diverged"], zero)
-        return EnvState(physics, obs, zero, no, no, metrics, jnp.zeros((), jnp.int32), memory, next_key)
+        counter, hidden = jnp.zeros((), jnp.int32), self.privileged(physics, memory)
+        return EnvState(physics, obs, hidden, zero, no, no, metrics, counter, memory, next_key)
 
     def step(self, state: EnvState, action: Float[Array, " nu"]) -> EnvState:
         """Apply an action for `frame_skip` time steps; an episode that ended is not reset, see `step_on`.
@@ -172,6 +184,7 @@ class Environment(InScene):
         return EnvState(
             physics=after,
             obs=obs,
+            privileged=self.privileged(after, memory),
             reward=jnp.asarray(sum(terms.values()), obs.dtype),
             terminated=terminated,
             truncated=(num_steps >= self.episode_length) & ~terminated,

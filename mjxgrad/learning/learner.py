@@ -48,6 +48,7 @@ class Learner(eqx.Module):
 
     Attributes:
         policy: the policy, with the moments of its observations.
+        normaliser: normalisation of what the value function sees, of which the policy's is the first part.
         critic: the value function.
         target: the target value function, which follows the critic and replaces it in targets and gradients.
         actor_moments: state of the policy's optimiser.
@@ -61,6 +62,7 @@ class Learner(eqx.Module):
     """
 
     policy: Policy
+    normaliser: Normaliser
     critic: ValueFunction
     target: ValueFunction
     actor_moments: optax.OptState
@@ -96,16 +98,18 @@ class ActorCritic(Method):
         # Otherwise all episodes would end together, and an update would see only one part of them.
         spread = jax.random.randint(spread_key, (count,), 0, self.environment.episode_length)
         environments = eqx.tree_at(lambda e: e.num_steps, environments, spread)
-        num_seen, num_actions = environments.obs.shape[-1], self.environment.num_actions
+        num_obs, num_seen = environments.obs.shape[-1], environments.seen.shape[-1]
+        normaliser = Normaliser.make(num_seen).with_more(environments.seen)
         # Actions before squashing, near zero at first.
-        sizes = num_seen, *settings.actor_layers, num_actions
+        sizes = num_obs, *settings.actor_layers, self.environment.num_actions
         actor = Network.make(sizes, actor_key, hidden_scale=settings.actor_scale, final_scale=FINAL_SCALE)
         critic = ValueFunction.make((num_seen, *settings.critic_layers, 1), critic_key)
         if not settings.has_critic:  # one that is zero, and is never fitted
             critic = jax.tree.map(lambda x: jnp.zeros_like(x) if eqx.is_inexact_array(x) else x, critic)
         actor_optimiser, critic_optimiser = optimisers(settings, self.num_updates)
         return Learner(
-            policy=Policy(actor, Normaliser.make(num_seen).with_more(environments.obs)),
+            policy=Policy(actor, normaliser.of_first(num_obs)),
+            normaliser=normaliser,
             critic=critic,
             target=critic,
             actor_moments=actor_optimiser.init(eqx.filter(actor, eqx.is_array)),
@@ -131,9 +135,11 @@ class ActorCritic(Method):
         if settings.has_critic:
             critic, target, critic_moments, critic_loss = self._fit_critic(learner, window, critic_key)
         episode_return, ended = _episodes(window, learner.episode_return)
+        normaliser = learner.normaliser.with_more(window.seen)
         following = dataclasses.replace(
             learner,
-            policy=eqx.tree_at(lambda p: p.normaliser, policy, learner.policy.normaliser.with_more(window.obs)),
+            policy=eqx.tree_at(lambda p: p.normaliser, policy, normaliser.of_first(environments.obs.shape[-1])),
+            normaliser=normaliser,
             critic=critic,
             target=target,
             actor_moments=actor_moments,
@@ -169,9 +175,9 @@ class ActorCritic(Method):
         arrays, structure = eqx.partition(self.environment, eqx.is_array)
 
         def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
-            arrays, policy, critic, stddev = shared
+            arrays, actor, critic, normaliser, stddev = shared
             own = eqx.combine(arrays, structure)
-            networks = (policy.actor, critic, policy.normaliser)
+            networks = (actor, critic, normaliser)
             return window_gradients(
                 own,
                 state,
@@ -184,7 +190,7 @@ class ActorCritic(Method):
             )
 
         # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
-        shared = (arrays, learner.policy, learner.target, stddev)
+        shared = (arrays, learner.policy.actor, learner.target, learner.normaliser, stddev)
         return over_devices(one, num_shared=1)(shared, environments, learner.model_keys, noise)
 
     def _improve(
@@ -195,7 +201,8 @@ class ActorCritic(Method):
         shortened, is_shortened = gradients.shortened(self.settings.largest_sample)
 
         def acted(actor: Network) -> Float[Array, "environments steps nu"]:
-            return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(window.obs)
+            obs = window.seen[..., : len(policy.normaliser.mean)]
+            return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(obs)
 
         _, pull_back = jax.vjp(acted, policy.actor)
         count = self.settings.num_environments
@@ -236,16 +243,16 @@ class ActorCritic(Method):
         self, learner: Learner, window: Window, key: PRNGKeyArray
     ) -> tuple[ValueFunction, ValueFunction, optax.OptState, Float[Array, ""]]:
         """Return value function and target fitted to the window's returns, the optimiser's state and the last pass's loss."""
-        normaliser = learner.policy.normaliser
+        normaliser = learner.normaliser
 
         def targets(window: Window) -> Float[Array, " steps"]:
             return lambda_returns(
-                window, lambda obs: learner.target(normaliser(obs)), self.settings.discount, _CRITIC_TRACE
+                window, lambda seen: learner.target(normaliser(seen)), self.settings.discount, _CRITIC_TRACE
             )
 
         wanted = jax.vmap(targets)(window).reshape(-1)
         critic, target = learner.critic.with_more(wanted), learner.target.with_more(wanted)
-        seen = normaliser(window.obs.reshape(len(wanted), -1))
+        seen = normaliser(window.seen.reshape(len(wanted), -1))
         _, optimiser = optimisers(self.settings, self.num_updates)
 
         def loss(network: Network, seen: Array, wanted: Array) -> Float[Array, ""]:

@@ -66,6 +66,10 @@ class Normaliser(eqx.Module):
         variance = jnp.where(self.count > 1, self.squares / jnp.maximum(self.count, 1), 1.0)
         return jnp.where(variance > 1e-8, jnp.sqrt(variance), 1.0)
 
+    def of_first(self, number: int) -> "Normaliser":
+        """Return the normalisation of the first numbers of an observation."""
+        return Normaliser(self.count, self.mean[:number], self.squares[:number])
+
     def with_more(self, obs: Float[Array, "*batch obs"]) -> "Normaliser":
         """Return the normalisation with more observations; those that are not finite are left out."""
         rows = obs.reshape(-1, obs.shape[-1])

@@ -35,23 +35,23 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.learning.networks import Network, Normaliser
 
-Value = Callable[[Float[Array, " obs"]], Float[Array, ""]]
+Value = Callable[[Float[Array, " seen"]], Float[Array, ""]]
 
 
 class Window(eqx.Module):
     """The steps of one environment, or a single step without the axis; under `jax.vmap` fields gain leading axes.
 
     Attributes:
-        obs: observation in which an action was chosen.
-        next_obs: observation after the action, before any reset.
+        seen: observation in which an action was chosen, and what is privileged behind it.
+        next_seen: the same after the action, before any reset.
         rewards: reward of the action.
         terminated: whether the episode ended for good.
         truncated: whether its time was up.
         metrics: the terms of the rewards, and `diverged`.
     """
 
-    obs: Float[Array, "*steps obs"]
-    next_obs: Float[Array, "*steps obs"]
+    seen: Float[Array, "*steps seen"]
+    next_seen: Float[Array, "*steps seen"]
     rewards: Float[Array, "*steps"]
     terminated: Bool[Array, "*steps"]
     truncated: Bool[Array, "*steps"]
@@ -59,7 +59,7 @@ class Window(eqx.Module):
 
     def next_values(self, value: Value) -> Float[Array, " steps"]:
         """Return the values after each step; zero after an episode that ended for good."""
-        return jnp.where(self.terminated, 0.0, jax.vmap(value)(self.next_obs))
+        return jnp.where(self.terminated, 0.0, jax.vmap(value)(self.next_seen))
 
     @property
     def done(self) -> Bool[Array, "*steps"]:
@@ -151,12 +151,12 @@ def run_window(
     """
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
-        action = jnp.tanh(actor(normaliser(state.obs)) + added)
+        action = jnp.tanh(actor(normaliser.of_first(state.obs.size)(state.obs)) + added)
         stepped, following = environment.step_on(state, action)
         ends = (stepped.terminated, stepped.truncated)
         if trace != 1:
             following = _faded(following, trace)
-        return following, Window(state.obs, stepped.obs, stepped.reward, *ends, stepped.metrics)
+        return following, Window(state.seen, stepped.seen, stepped.reward, *ends, stepped.metrics)
 
     final, window = jax.lax.scan(advance, state, noise)
     return window, final
@@ -193,14 +193,14 @@ def window_gradients(
     """
     copy = environment.randomised(model_key)
 
-    def value(obs: Float[Array, " obs"]) -> Float[Array, ""]:
-        return critic(normaliser(obs))
+    def value(seen: Float[Array, " seen"]) -> Float[Array, ""]:
+        return critic(normaliser(seen))
 
     def gain(change: Float[Array, "steps nu"]):
         window, final = run_window(copy, state, actor, normaliser, stddev * noise + change, trace)
         return returned(window, value, discount, trace), (window, final)
 
     first, (window, final) = jax.grad(gain, has_aux=True)(jnp.zeros_like(noise))
-    advantages = lambda_returns(window, value, discount, trace) - jax.vmap(value)(window.obs)
+    advantages = lambda_returns(window, value, discount, trace) - jax.vmap(value)(window.seen)
     zeroth = (weights_in_return(window, discount) * advantages)[:, None] * noise / stddev
     return window, final, Gradients(first, zeroth, jnp.isfinite(first).all(axis=1))

@@ -1,0 +1,172 @@
+"""Do gradients of a frozen policy point where its return rises? `make gradient_audit`.
+
+A policy learns for a while and is frozen. Each kind of gradient then names a direction in the space of its parameters:
+
+- the cosines between the direction that a batch of windows finds and a reference, the mean of the unit directions that all
+  kinds find in other windows;
+- the slope, what a long return gains along the direction that all windows find: by central differences in MuJoCo's own
+  motion with the same noise on both sides, per unit of root-mean-square change of the actions.
+"""
+
+import itertools
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray
+
+import mjxgrad as mg
+from experiments.benchmarks import announce
+from experiments.learning import stiffer
+from experiments.words import quantity
+from mjxgrad import envs, learning
+from mjxgrad.envs import Environment
+from mjxgrad.learning.window import Gradients, Window, returned, run_window, window_gradients
+from mjxgrad.stepping import Contact
+
+_KINDS = {"own": mg.Discrete(), "slope": mg.Slope(), "onset": mg.Onset()}
+_LIMITS = (math.inf, 0.3, 0.1)
+_MIXED = 96  # actions by which copies of a state are driven apart
+_LONG = 192  # actions of the long return, which the value function ends
+_WIDTH = 0.05  # rms change of the actions, of the central differences
+_MOST_BATCHES = 32
+
+
+def gradient_audit(
+    *,
+    environment: str = "ant",
+    substeps: int = 8,
+    stiffness: float = 1.0,
+    updates: int = 300,
+    environments: int = 64,
+    windows: int = 4096,
+    batches: tuple[int, ...] = (64, 256, 1024),
+    traces: tuple[float, ...] = (1.0, 0.8),
+    seed: int = 0,
+) -> None:
+    """Print the table: a line per kind of gradient, λ and limit of a sample.
+
+    Args:
+        environment: a name of DiffRL's tasks.
+        substeps: time steps per action.
+        stiffness: factor of the stiffness of contact.
+        updates: updates after which the policy is frozen.
+        environments: copies in which it learned.
+        windows: windows of which directions are made; the reference is from as many others.
+        batches: numbers of windows whose directions are compared with the reference.
+        traces: each λ of the blended adjoint.
+        seed: of everything.
+    """
+    mg.keep_compiled()
+    announce(f"{environment}, contact {stiffness:g} times as stiff, {updates} updates, {windows} windows, float32")
+    settings = learning.Settings(num_environments=environments)
+    task = getattr(envs.diffrl, environment)(num_substeps=substeps)
+    task = task.with_softness(stiffer(task, stiffness))
+    learned = learning.learn(task, jax.random.key(seed), num_updates=updates, settings=settings)
+    print(learned, flush=True)
+    frozen = _Frozen(learned, task, settings)
+    keys = jax.random.split(jax.random.key(seed + 1), 4)
+    starts, others = (jax.jit(lambda k: frozen.starts(k, windows))(key) for key in keys[:2])
+    noise = jax.random.normal(keys[2], (windows, settings.window, task.num_actions))
+    found, references = {}, {}
+    for (name, trace), program in frozen.compiled(traces, starts, noise).items():
+        window, gradients = program(starts, noise)
+        other_window, other = program(others, noise[::-1])
+        for limit in _LIMITS:
+            found[name, trace, limit] = window.seen, gradients.sound.shortened(limit)[0].first
+        limited = other.sound.shortened(_LIMITS[-1])[0]
+        references[name, trace] = frozen.direction(other_window.seen, limited.first)
+        found["zeroth", trace, math.inf] = window.seen, gradients.zeroth
+        references["zeroth", trace] = frozen.direction(other_window.seen, other.zeroth)
+    reference = jnp.stack([one / jnp.linalg.norm(one) for one in references.values()]).mean(axis=0)
+    rise = jax.jit(frozen.rise)
+    long_noise = jax.random.normal(keys[3], (windows, _LONG, task.num_actions))
+    heads = ["gradient", "λ", "limit", *(f"cosine, {size}" for size in batches), "slope"]
+    print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+    for (name, trace, limit), (seen, by_action) in sorted(found.items()):
+        cosines = [_cosines(frozen, seen, by_action, size, reference) for size in batches]
+        rises = np.asarray(rise(frozen.direction(seen, by_action), starts, long_noise))
+        told = [quantity(rises.mean(), rises.std(ddof=1) / math.sqrt(windows))]
+        told = [quantity(x.mean(), x.std(ddof=1) / math.sqrt(len(x))) for x in cosines] + told
+        print(f"| {' | '.join([name, f'{trace:g}', f'{limit:g}', *told])} |", flush=True)
+
+
+def _cosines(
+    frozen: "_Frozen", seen: Array, by_action: Array, size: int, reference: Array
+) -> Float[np.ndarray, " batches"]:
+    batches = [slice(i, i + size) for i in range(0, len(seen) - size + 1, size)][:_MOST_BATCHES]
+    directions = (frozen.direction(seen[rows], by_action[rows]) for rows in batches)
+    return np.array([one @ reference / jnp.linalg.norm(one) / jnp.linalg.norm(reference) for one in directions])
+
+
+class _Frozen:
+    """A policy that no longer learns, its value function, and the states it was in."""
+
+    def __init__(self, learned: learning.Learned, task: Environment, settings: learning.Settings):
+        self.task, self.settings, self.learner = task, settings, learned.learner
+        params, rest = eqx.partition(learned.policy.actor, eqx.is_inexact_array)
+        self.params, unravel = ravel_pytree(params)
+        self.actor_of = lambda flat: eqx.combine(unravel(flat), rest)
+        self.stddev = jnp.asarray(settings.stddev[1])
+
+    def value(self, seen: Float[Array, " seen"]) -> Float[Array, ""]:
+        return self.learner.target(self.learner.normaliser(seen))
+
+    def follow(self, flat: Array, state, noise: Array) -> tuple[Window, object]:
+        return run_window(self.task, state, self.actor_of(flat), self.learner.normaliser, self.stddev * noise)
+
+    def starts(self, key: PRNGKeyArray, number: int):
+        """Draw states: copies of those in which learning ended, driven apart by noise on the actions."""
+        own, driven = jax.random.split(key)
+        states = self.learner.environments
+        taken = jnp.arange(number) % self.settings.num_environments
+        copies = eqx.tree_at(lambda s: s.key, jax.tree.map(lambda x: x[taken], states), jax.random.split(own, number))
+        noise = jax.random.normal(driven, (number, _MIXED, self.task.num_actions))
+        return jax.vmap(lambda state, noise: self.follow(self.params, state, noise)[1])(copies, noise)
+
+    def compiled(self, traces: tuple[float, ...], *example) -> dict:
+        """Return programs from states and noise to windows and gradients, by kind and λ; they compile side by side."""
+
+        def lowered(contact: Contact, trace: float):
+            task, learner, settings = self.task.with_contact(contact), self.learner, self.settings
+
+            def one(state, noise: Array) -> tuple[Window, Gradients]:
+                networks = (self.actor_of(self.params), learner.target, learner.normaliser)
+                window, _, gradients = window_gradients(
+                    task, state, learner.key, noise, *networks, self.stddev, settings.discount, trace
+                )
+                return window, gradients
+
+            return jax.jit(jax.vmap(one)).lower(*example)
+
+        wanted = list(itertools.product(_KINDS, traces))
+        with ThreadPoolExecutor() as pool:
+            programs = list(pool.map(lambda one: one.compile(), [lowered(_KINDS[k], trace) for k, trace in wanted]))
+        return {(name, trace): program for (name, trace), program in zip(wanted, programs, strict=True)}
+
+    def direction(self, seen: Float[Array, "windows steps seen"], by_action: Float[Array, "windows steps nu"]) -> Array:
+        """Return the mean gradient by the parameters."""
+        return jax.vjp(lambda flat: self.actions(flat, seen), self.params)[1](by_action)[0] / len(seen)
+
+    def actions(self, flat: Array, seen: Float[Array, "*rows seen"]) -> Float[Array, "*rows nu"]:
+        actor, rows = self.actor_of(flat), seen.reshape(-1, seen.shape[-1])
+        obs = self.learner.normaliser(rows)[:, : self.learner.policy.normaliser.mean.size]
+        return jax.vmap(actor)(obs).reshape(*seen.shape[:-1], -1)
+
+    def rise(self, direction: Array, states, noise: Float[Array, "windows steps nu"]) -> Float[Array, " windows"]:
+        """Return the slope of the long return along a direction, by start."""
+        change = jax.jvp(lambda flat: self.actions(flat, states.seen), (self.params,), (direction,))[1]
+        step = _WIDTH * direction / jnp.sqrt((change**2).mean())
+
+        def gain(side: float) -> Float[Array, " windows"]:
+            def one(state, noise: Array) -> Float[Array, ""]:
+                window, _ = self.follow(self.params + side * step, state, noise)
+                return returned(window, self.value, self.settings.discount)
+
+            return jax.vmap(one)(states, noise)
+
+        return (gain(1.0) - gain(-1.0)) / (2 * _WIDTH)
