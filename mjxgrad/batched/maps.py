@@ -44,15 +44,13 @@ _MOST_FUSED = 4
 
 
 class Bilinear:
-    """The map c_k = Σ_ij T_kij a_i b_j along the last axis, for a constant T."""
+    """The map c_k = Σ_ij T_kij a_i b_j along the last axis, for a constant T; both factors have the same leading axes."""
 
     def __init__(self, table: np.ndarray):
-        """Keep the terms of T that are not zero."""
         self._size = len(table)
         self._terms = _ordered((*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table))  # pyright: ignore[reportArgumentType]
 
     def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
-        """Return c; both factors have the same leading axes."""
         return _bilinear.bind(a, b, terms=self._terms, size=self._size, batch=0)
 
 

@@ -271,7 +271,7 @@ def _warnings_at(speed: float, spring: Spring) -> Iterator[str]:
 
 
 def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityReport:
-    """Check whether the time step of a scene resolves its contacts, limits and equalities.
+    """Check whether the time step of a scene resolves its contacts, limits and equalities; `print` the report.
 
     Nothing is simulated. The limits are those of a single spring and damper, see this module.
 
@@ -279,9 +279,6 @@ def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityRep
         scene: a scene with known values.
         speed: speed at which geoms approach each other, in m/s. Passing through, depth and onsets depend on it and are
             checked only where it is given.
-
-    Returns:
-        The report: `print` it, or read its `warnings`.
 
     Raises:
         ValueError: if the speed is not positive, or the scene is batched or traced.

@@ -49,7 +49,7 @@ def load(
 
 
 def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterations: int = 100) -> Foreign:
-    """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`.
+    """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`, and return the object.
 
     Args:
         environment: an object with these methods on MJX's JAX implementation: from Playground, from brax's backend "mjx", or
@@ -57,9 +57,6 @@ def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterat
         contact: how contact is stepped, see `mg.step`.
         iterations: least limit on the solver's iterations; it stops at the model's tolerance. Many of their models stop after
             1 to 4, where the solve's derivative is not yet that of the motion.
-
-    Returns:
-        The same object.
 
     Raises:
         ValueError: if contact does not suit `mg.step`.

@@ -37,10 +37,8 @@ _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale o
 def parameter(scene: Scene, text: str) -> Parameter:
     """Return a parameter from text such as `mass:torso`, `friction`, `damping:hip,knee=0.1..5` or `delay=0..0.05`.
 
-    Args:
-        scene: the scene with the nominal values.
-        text: one of `KINDS`, then names that share one value, then bounds. Friction and softness take geoms, or a pair as
-            `floor/foot`, or nothing for all contacts.
+    The text is one of `KINDS`, then names that share one value, then bounds. Friction and softness take geoms, or a pair as
+    `floor/foot`, or nothing for all contacts. The scene has the nominal values.
 
     Raises:
         ValueError: if the text has another form, or a name is unknown.
@@ -75,18 +73,15 @@ def parameter(scene: Scene, text: str) -> Parameter:
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
-    """Return a recorded motion, and the names of the columns that do not belong to the scene.
+    """Return a motion recorded as CSV with a line of names, or as NPZ, and the names of columns that the scene does not have.
 
     Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
     `act:actuator`, readings `sensor:name`. The kind may be left out for a unique name: a joint is then its position, an
     actuator its control. An element with several numbers takes an index, `qpos:root[0]`, or `qpos[7]` in the whole array. An
-    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers.
+    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers. Empty cells and
+    NaN were not measured.
 
     Each signal is weighed by its variation. The motion begins at its first row; missing parts are the scene's pose, at rest.
-
-    Args:
-        scene: the recorded scene.
-        path: CSV with a line of names, or NPZ. Empty cells and NaN were not measured.
 
     Raises:
         ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator.

@@ -33,11 +33,7 @@ _REACH = np.array([np.log(10) / 2, *[np.log(2) / 2] * 3, *[0.5] * 3, *[0.5] * 3]
 
 
 def inertia(scene: Scene, body: str) -> Parameter:
-    """Return mass, centre of mass and inertia tensor of a body as ten unconstrained numbers.
-
-    Args:
-        scene: the scene with the nominal values.
-        body: name of the body.
+    """Return mass, centre of mass and inertia tensor of a named body as ten unconstrained numbers.
 
     Raises:
         ValueError: if there is no such body, or a flat body makes a logarithm infinite.

@@ -14,12 +14,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness
-from mjxgrad.contact.parameters import ContactPair, contact_parameters, deciding_geoms
+from mjxgrad.contact.parameters import Pairs, contact_parameters, deciding_geoms
 from mjxgrad.scene import Scene
 from mjxgrad.stepping.rows import index_of
 
 Write = Callable[[mjx.Model, Array], dict[str, Array]]
 """Function from a model and the parameter's value to the changed fields of the model."""
+Bounds = tuple[float, float] | None
 _Object = mujoco.mjtObj
 _FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
 _AT_BOUND = 1e-6  # share of the range
@@ -124,13 +125,10 @@ def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping
     return scene.with_model(**changed) if changed else scene
 
 
-def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def mass(scene: Scene, *bodies: str, bounds: Bounds = None) -> Parameter:
     """Return the mass of a body, or the common mass of several (kg); inertias scale with it, as with the density.
 
-    Args:
-        scene: the scene with the nominal value.
-        *bodies: names of the bodies.
-        bounds: least and greatest value; a tenth and ten times the nominal value by default.
+    The bounds are a tenth and ten times the scene's value by default.
 
     Raises:
         ValueError: if there is no such body.
@@ -149,10 +147,7 @@ def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) 
 def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset: Any) -> Parameter:
     """Return the common sliding friction of the selected contacts; all geoms that determine it receive the value.
 
-    Args:
-        scene: the scene with the nominal value.
-        bounds: least and greatest coefficient.
-        **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
+    The contacts are selected by `pairs` or `geoms`, as in `Softness`; all by default.
 
     Raises:
         ValueError: if a name is unknown or can touch nothing.
@@ -174,14 +169,10 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
     return _positive(float(present[0, 0]), bounds, write, "", "friction")
 
 
-def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = None, **subset: Any) -> Parameter:
-    """Return one part of the contact softness.
+def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -> Parameter:
+    """Return one part of the softness of the selected contacts; contacts as in `friction`, bounds as in `mass`.
 
-    Args:
-        scene: the scene with the nominal value.
-        part: "stiffness" (1/s²), "damping_ratio", which determines the restitution, or "width" (m).
-        bounds: least and greatest value; a tenth and ten times the nominal value by default.
-        **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
+    The parts are "stiffness" (1/s²), "damping_ratio", which determines the restitution, and "width" (m).
 
     Raises:
         ValueError: if there is no such part, or as `Softness`.
@@ -199,28 +190,28 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
     return _positive(float(getattr(present, part)[0]), bounds, write, units[part], part)
 
 
-def _touching(scene: Scene, named: Softness) -> tuple[ContactPair, ...]:
+def _touching(scene: Scene, named: Softness) -> Pairs:
     if found := named.selected(scene.model):
         return found
     raise ValueError(f"friction and softness need geoms that can touch, got none in {scene.name}")
 
 
-def damping(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def damping(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the damping of a joint, or the common damping of several (N s/m or N m s/rad); otherwise as `mass`."""
     return _of_joints(scene, "dof_damping", joints, bounds)
 
 
-def armature(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def armature(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the armature of a joint, or the common armature of several (kg or kg m²); otherwise as `mass`."""
     return _of_joints(scene, "dof_armature", joints, bounds)
 
 
-def friction_loss(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def friction_loss(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the dry friction of a joint, or the common friction of several (N or N m); otherwise as `mass`."""
     return _of_joints(scene, "dof_frictionloss", joints, bounds)
 
 
-def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def gear(scene: Scene, *actuators: str, bounds: Bounds = None) -> Parameter:
     """Return the first gear number of an actuator, or the common one of several; otherwise as `mass`."""
 
     def place(model: mjx.Model) -> tuple:
@@ -230,12 +221,7 @@ def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = Non
 
 
 def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
-    """Return the two gains of a position actuator, `kp` and `kv`.
-
-    Args:
-        scene: the scene with the nominal values.
-        actuator: name of the actuator.
-        bounds: least and greatest value, each a number or one per gain; a tenth and ten times the nominal values by default.
+    """Return the two gains of a position actuator, `kp` and `kv`; bounds as in `mass`, each a number or one per gain.
 
     Raises:
         ValueError: if there is no such actuator, or a gain is zero and no bounds are given.
@@ -250,7 +236,7 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
     return _positive(-np.asarray(scene.model.actuator_biasprm)[index, 1:3], bounds, write, "", "gains")
 
 
-def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[float, float] | None) -> Parameter:
+def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: Bounds) -> Parameter:
     def place(model: mjx.Model) -> tuple:
         index = [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]
         return (np.flatnonzero(np.isin(model.dof_jntid, index)),)
@@ -258,9 +244,7 @@ def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[
     return _common(scene, field, place, bounds, field.removeprefix("dof_"))
 
 
-def _common(
-    scene: Scene, field: str, place: Callable[[mjx.Model], tuple], bounds: tuple[float, float] | None, name: str
-) -> Parameter:
+def _common(scene: Scene, field: str, place: Callable[[mjx.Model], tuple], bounds: Bounds, name: str) -> Parameter:
     """Return the common number at some places of a model's array."""
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, UInt8
 
 from mjxgrad._arrays import instance
 from mjxgrad._text import write
-from mjxgrad.rollouts.trajectory import Trajectory
+from mjxgrad.rollouts.state import Trajectory
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -40,7 +40,7 @@ def frames(
     width: int = 640,
     camera: str | int | mujoco.MjvCamera | None = None,
 ) -> Frames:
-    r"""Draw a trajectory at the frame times of a video.
+    r"""Return frames of a trajectory at the frame times of a video.
 
     Frame $i$ shows time $i \cdot$ `speed` / `fps`, by the nearest state: states are close in time, and the mean of
     two quaternions is not the orientation between them.
@@ -55,9 +55,6 @@ def frames(
         width: width in pixels.
         camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view, which goes along
             with a body that would leave it.
-
-    Returns:
-        The frames.
 
     Raises:
         ValueError: if `qpos` has no state, does not fit the model or is not finite, if a number is not positive, or

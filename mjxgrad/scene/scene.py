@@ -20,7 +20,7 @@ from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
-from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
+from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.refusals import has_medium
@@ -61,7 +61,7 @@ class Scene(eqx.Module):
     mj_model: mujoco.MjModel = eqx.field(static=True)
     omissions: tuple[Omission, ...] = eqx.field(static=True)
     conversions: tuple[Conversion, ...] = eqx.field(static=True)
-    pairs: tuple[ContactPair, ...] = eqx.field(static=True)
+    pairs: Pairs = eqx.field(static=True)
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
 

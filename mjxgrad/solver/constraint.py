@@ -295,9 +295,7 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
     return Noise(rows.noise.spread[which], rows.noise.gate[which])
 
 
-def _mean_violation(
-    x: Float[Array, "n *batch"], noise: Noise
-) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
+def _mean_violation(x: _PerRow, noise: Noise) -> tuple[_PerRow, _PerRow]:
     """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.
 
     Above the gate the acceleration ends the force before the distance does, and the mean is the softened ramp. Below the

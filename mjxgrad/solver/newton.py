@@ -18,7 +18,7 @@ an update along the line would keep rounding errors from a poor start.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -31,8 +31,8 @@ from mjxgrad.batched import device, linear, on_gpu
 from mjxgrad.bodies.kinematics import Inertia
 from mjxgrad.solver import constraint, hessian
 from mjxgrad.solver.constraint import RowLayout, Rows
+from mjxgrad.solver.hessian import SparseRows, num_dense_rows
 from mjxgrad.solver.jacobian import JoinedRows, RowMap
-from mjxgrad.solver.sparse import SparseRows, num_dense_rows
 
 _Vector = Float[Array, "nv *batch"]
 _OfRows = PyTree[Float[Array, "_ *batch"]]
@@ -78,16 +78,11 @@ class Variant(eqx.Module):
     parts: tuple[RowMap | None, ...] | None = None
 
     def __getitem__(self, number: int) -> "Variant":
-        """Return the variant of one solve."""
         return jax.tree.map(lambda x: x[number], self)
 
 
-@jax.tree_util.register_pytree_node_class
-@dataclasses.dataclass(frozen=True)
-class System:
+class System(eqx.Module):
     """The equations of motion of one state, in a form that can be differentiated.
-
-    As a pytree it is a list of arrays, without the None of parts that are absent; see `linear.batch_last`.
 
     Attributes:
         inertia: M.
@@ -102,20 +97,6 @@ class System:
     map: JoinedRows
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
-
-    def tree_flatten(self) -> tuple[Sequence[Any], Any]:
-        """Return the arrays and the structure that holds them."""
-        # JAX may have put None in place of arrays: only the structure that was kept tells them from absent parts.
-        fields = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return vars(self).get("_flat") or jax.tree.flatten(tuple(fields))
-
-    @classmethod
-    def tree_unflatten(cls, structure: Any, leaves: Any) -> "System":
-        """Return a system from its arrays; not by the constructor, whose check of shapes fails under `jax.vmap`."""
-        self = object.__new__(cls)
-        names = (field.name for field in dataclasses.fields(cls))
-        vars(self).update(zip(names, jax.tree.unflatten(structure, leaves), strict=True), _flat=(leaves, structure))
-        return self
 
     def mv(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
