@@ -1,9 +1,4 @@
-"""Scenes with a cost and noise: a throw over a wall, gymnasium's hopper, and the classes for your own.
-
-References:
-    Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-    arXiv:2202.00817, figure 2 (the throw, there in closed form).
-"""
+"""Scenes with a cost and noise: a throw over a wall, gymnasium's hopper, and the classes for your own."""
 
 from pathlib import Path
 
@@ -105,7 +100,8 @@ def ball_wall() -> BallWall:
     """Return a throw at an angle: 2 m/s, a target 0.38 m away, and 0.42 s, by when every throw has landed and stopped.
 
     Throws between about 35 and 74 degrees clear the scene's wall (0.2 m away, 8 cm high). The cost jumps at 35 degrees, where
-    first-order and zeroth-order gradients differ; the best throw at the target is at 57 degrees.
+    first-order and zeroth-order gradients differ (Suh et al., ICML 2022, arXiv:2202.00817, figure 2). The best throw at the
+    target is at 57 degrees.
     """
     return BallWall(load_scene(scene_path("ball_wall")), jnp.asarray(2.0), jnp.asarray(0.38), horizon=210)
 

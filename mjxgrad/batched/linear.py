@@ -75,11 +75,8 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
 def batch_last(function: Callable, batch: int | None = None) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank.
-
-    Args:
-        function: takes and returns pytrees of arrays.
-        batch: the size of a trailing axis that the arrays have already; None without one.
+    The function takes and returns pytrees of arrays. Nested batches are merged into one axis, which makes longer vectors and
+    arrays of lower rank; `batch` is the size of a trailing axis that the arrays have already.
     """
     # Under `jax.jit` constants stay inside. `custom_vmap` refuses to batch constants, which `jax.lax.cond` requires
     # where its condition differs between members of the batch.

@@ -225,7 +225,6 @@ def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
 
 
 def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
-    """Return entries at constant places along an axis."""
     if np.array_equal(index, np.arange(x.shape[axis])):
         return x
     return jnp.take(x, index, axis=axis, mode="clip")
@@ -315,7 +314,6 @@ def _where_longer(count: np.ndarray) -> list[int]:
 
 
 def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
-    """Return sums of similar lengths."""
     is_term = rows != 0
     count = int(is_term.sum(axis=1).max(initial=0))
     if not 0 < count <= _MOST_GATHERED:

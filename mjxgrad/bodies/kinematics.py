@@ -18,7 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mjxgrad._mjx import mjx
 from mjxgrad.batched import maps
@@ -28,6 +28,7 @@ from mjxgrad.bodies.orientation import orientation
 
 _Position = Float[Array, " nq"]
 _Vector = Float[Array, " nv"]
+_Duration = Float[Array, ""] | float
 _Index = Int[np.ndarray, " _"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -249,7 +250,7 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
     return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
 
 
-def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[ArrayLike, ""]) -> _Position:
+def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duration: _Duration) -> _Position:
     """Return the position after a duration (s) at constant joint velocity; quaternions turn in their own frame."""
     dof, entry, quaternions, turns = _places(model)
     if not quaternions.size:

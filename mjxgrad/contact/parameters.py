@@ -92,9 +92,8 @@ class ContactParameters(eqx.Module):
     def rest_depth(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
         """Return the depth at rest below the distance at which contact begins (m); $(1 - d_w) a_0 / k$ for constant impedance.
 
-        Args:
-            acceleration: the acceleration $a_0$ at which the bodies would approach without contact, in m/s². For one body on
-                the ground it is gravity, for a stack of n equal ones n times that. `contact.law` says when this is exact.
+        Without contact the bodies would approach at the acceleration $a_0$ (m/s²). For one body on the ground it is gravity, for
+        a stack of n equal ones n times that. `contact.law` says when this is exact.
         """
         return rest_depth(self.pyramid * acceleration, self.stiffness, self.solimp)
 

@@ -291,8 +291,7 @@ def bias_variance(
         ValueError: if `params` is not a matrix, `softness` has no or unequal leading axes, or a number is out of range.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, section 3 (bias) and figure 4 (variance against stiffness).
+        Suh, Simchowitz, Zhang, Tedrake. ICML 2022, arXiv:2202.00817, section 3 (bias), figure 4 (variance against stiffness).
     """
     if jnp.ndim(params) != 2:
         raise ValueError(

@@ -27,13 +27,8 @@ def load(
     """Load an environment of MuJoCo Playground, to be stepped by `mg.step`.
 
     The object is Playground's own and works with its wrappers and randomisers. Its motion is Playground's with a converged
-    solver, unless `contact` changes it.
-
-    Args:
-        name: name for `registry.load`, for instance "CartpoleSwingup".
-        config_overrides: values by flattened name; `impl` is always "jax", the implementation that has derivatives.
-        contact: see `stepped_right`.
-        iterations: see `stepped_right`.
+    solver, unless `contact` changes it. The name, such as "CartpoleSwingup", is that of `registry.load`. The overrides are
+    values by flattened name; `impl` is always "jax", which has derivatives. All else is as in `stepped_right`.
 
     Raises:
         ImportError: if playground is not installed.

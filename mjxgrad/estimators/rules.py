@@ -116,8 +116,7 @@ class BiasConstrained(eqx.Module):
         failure_probability: $\delta$, below 1.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, section 4.
+        Suh, Simchowitz, Zhang, Tedrake. ICML 2022, arXiv:2202.00817, section 4; see `first_order`.
     """
 
     gamma: ArrayLike

@@ -16,7 +16,6 @@ import numpy as np
 
 from mjxgrad._text import write
 from mjxgrad.identification import parameters
-from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import Parameter
 from mjxgrad.identification.recording import Recording, start_of
 from mjxgrad.scene import Scene
@@ -69,7 +68,7 @@ def parameter(scene: Scene, text: str) -> Parameter:
         return getattr(parameters, kind)(scene, *names, bounds=bounds)
     if len(names) > 1 or (bounds is not None and kind == "inertia"):
         raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
-    return inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
+    return parameters.inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:

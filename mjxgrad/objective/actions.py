@@ -193,11 +193,8 @@ def open_loop(task: Task, stddev: Stddev) -> OpenLoop:
     r"""Return the cost of a task as a function of its controls, with noise on each.
 
     The parameters are the horizon * nu controls, flattened by `objective.ravel`; the score is $w/\sigma^2$. Where the task has
-    a distribution of starts, every rollout draws its own.
-
-    Args:
-        task: the controlled task with its cost.
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
+    a distribution of starts, every rollout draws its own. The standard deviation $\sigma > 0$ is in units of the controls, of
+    any shape that broadcasts to (horizon, nu).
 
     Raises:
         ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
@@ -310,14 +307,9 @@ def linear_policy(
         policy, params = linear_policy(4, 1)
         objective = closed_loop(task, policy, stddev=0.1, params=params)
 
-    Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero.
-
-    Args:
-        num_states: number of observed values.
-        num_controls: number of controls.
-        bias: whether there is the constant k.
-        observe: function from the task's state or observations to a vector. Positions of a free body contain a
-            quaternion, and angles do not wrap, so choose what you need.
+    Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero. x is the whole
+    state, or the vector of `num_states` numbers that `observe` makes of the task's state or observations. Positions of a free
+    body contain a quaternion, and angles do not wrap, so choose what you need. Without `bias` there is no k.
 
     Raises:
         ValueError: if a number is below 1.

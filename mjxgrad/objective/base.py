@@ -248,12 +248,9 @@ def parameter_noise(
 ) -> ParameterNoise:
     r"""Smooth any function of parameters by Gaussian noise on them.
 
-    $F(\theta) = \mathbb{E}[f(\theta + w)]$, $w \sim N(0, \sigma^2 I)$, with score $w/\sigma^2$.
-
-    Args:
-        function: function from a vector, or from the pytree of parameters, to a scalar; traceable by JAX.
-        stddev: $\sigma > 0$, in the parameters' units; one number, or one per parameter.
-        dim: number of parameters, needed only to draw noise by hand: an estimator takes it from its parameters.
+    $F(\theta) = \mathbb{E}[f(\theta + w)]$, $w \sim N(0, \sigma^2 I)$, with score $w/\sigma^2$. The function, of a vector or of
+    the pytree of parameters, is traceable. $\sigma > 0$ is in the parameters' units, one number or one per parameter. Their
+    number `dim` is needed only to draw noise by hand: an estimator takes it from its parameters.
 
     Raises:
         ValueError: if `stddev` is not positive, or neither one number nor `dim` of them.

@@ -187,7 +187,7 @@ def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
 
 
 def check_scene(scene: Any) -> None:
-    """Refuse an argument that is no scene."""
+    """Refuse what is no scene."""
     instance("scene", scene, Scene, "of mg.load_scene")
 
 

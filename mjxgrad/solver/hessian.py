@@ -29,15 +29,10 @@ _MAX_SHIFT = 0.01
 
 
 class SparseRows(eqx.Module):
-    """The entries of a Jacobian, group by group, without those that are always zero.
+    """The entries of a Jacobian, group by group, without those that are always zero."""
 
-    Attributes:
-        pieces: entries by item, direction and joint velocity.
-        friction: μ of each tangent of a pyramid; None for other rows.
-    """
-
-    pieces: tuple[Float[Array, "_ _ _ *batch"], ...]
-    friction: tuple[Float[Array, "_ _ *batch"] | None, ...]
+    pieces: tuple[Float[Array, "_ _ _ *batch"], ...]  # entries by item, direction and joint velocity
+    friction: tuple[Float[Array, "_ _ *batch"] | None, ...]  # μ of each tangent of a pyramid; None for other rows
     groups: tuple[Group, ...] = eqx.field(static=True)
     num_dofs: int = eqx.field(static=True)
 

@@ -65,36 +65,22 @@ _RESOLVED = 1e-3
 
 
 class Variant(eqx.Module):
-    """The differences between two solves of one state. For two solves arrays have a leading axis of two.
+    """The differences between two solves of one state. For two solves arrays have a leading axis of two."""
 
-    Attributes:
-        weight: weights D of the rows.
-        reference: a_ref of the rows; None keeps the system's.
-        parts: parts of J to replace, where contacts may act from another side.
-    """
-
-    weight: Float[Array, "*two rows"]
-    reference: Float[Array, "*two rows"] | None = None
-    parts: tuple[RowMap | None, ...] | None = None
+    weight: Float[Array, "*two rows"]  # weights D of the rows
+    reference: Float[Array, "*two rows"] | None = None  # a_ref of the rows; None keeps the system's
+    parts: tuple[RowMap | None, ...] | None = None  # parts of J to replace, where contacts may act from another side
 
     def __getitem__(self, number: int) -> "Variant":
         return jax.tree.map(lambda x: x[number], self)
 
 
 class System(eqx.Module):
-    """The equations of motion of one state, in a form that can be differentiated.
+    """The equations of motion of one state, in a form that can be differentiated."""
 
-    Attributes:
-        inertia: M.
-        force: f_smooth, all forces except those of constraints (N or N m).
-        map: J, inactive rows included.
-        is_active: whether each row is active.
-        rows: parameters of the rows' laws.
-    """
-
-    inertia: Inertia
-    force: _Vector
-    map: JoinedRows
+    inertia: Inertia  # M
+    force: _Vector  # f_smooth, all forces except those of constraints (N or N m)
+    map: JoinedRows  # J, inactive rows included
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
 
@@ -208,7 +194,7 @@ _Parts = tuple[Float[Array, " height"], *tuple[Float[Array, " width"], ...]]
 
 
 class _KernelRows(NamedTuple):
-    """Parameters of uncoupled rows, whose forces are -D x between bounds; parts as in `_KernelProblem`."""
+    """Parameters of uncoupled rows, whose forces are -D x between bounds."""
 
     reference: _Parts
     weight: _Parts

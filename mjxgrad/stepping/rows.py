@@ -28,35 +28,21 @@ _PerRow = Float[Array, " rows"]
 
 
 class Block(eqx.Module):
-    """Constraint rows of one kind, before gating and scaling. All fields have the rows as leading axis.
+    """Constraint rows of one kind, before gating and scaling. All arrays have the rows as leading axis."""
 
-    Attributes:
-        map: J, from joint velocities to the rows, inactive rows included.
-        residual: r in a_ref (m or rad).
-        impedance: d(r), with dw and d0.
-        solimp: parameters of the impedance.
-        inverse_weight: Â, inverse inertia (1/kg).
-        solref: stiffness and damping in MuJoCo's formats.
-        margin: distance at which the row begins (m or rad).
-        friction_loss: largest force of a friction loss row.
-        is_active: whether the row takes part.
-        drift: J̇ v, the change of the rate without joint accelerations (m/s² or rad/s²); None where it is not used.
-        rows_each: number of consecutive rows of each contact or limit, which begin and end together; 0 if none does.
-        is_pyramid: whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
-        is_contact: whether the rows belong to contacts.
-    """
-
-    map: RowMap
-    residual: _PerRow
-    impedance: Impedance
+    map: RowMap  # J, from joint velocities to the rows, inactive rows included
+    residual: _PerRow  # r in a_ref (m or rad)
+    impedance: Impedance  # d(r), with dw and d0
     solimp: Float[Array, "rows 5"]
-    inverse_weight: _PerRow
+    inverse_weight: _PerRow  # Â, inverse inertia (1/kg)
     solref: Float[Array, "rows 2"]
-    margin: _PerRow
-    friction_loss: _PerRow
+    margin: _PerRow  # distance at which the row begins (m or rad)
+    friction_loss: _PerRow  # largest force of a friction loss row
     is_active: Bool[Array, " rows"]
-    drift: _PerRow | None = None
+    drift: _PerRow | None = None  # J̇ v, the change of the rate without joint accelerations (m/s² or rad/s²)
+    # Number of consecutive rows of each contact or limit, which begin and end together; 0 if none does.
     rows_each: int = eqx.field(static=True, default=0, kw_only=True)
+    # Whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
     is_pyramid: bool = eqx.field(static=True, default=False, kw_only=True)
     is_contact: bool = eqx.field(static=True, default=False, kw_only=True)
 
