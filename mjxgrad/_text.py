@@ -46,7 +46,7 @@ def format_number(x: float) -> str:
 
 
 def write(path: str | Path, content: str | bytes) -> None:
-    """Write a file beside its place and rename it, so that a full disk leaves what was there.
+    """Write a file beside its place and rename it, so that a full disk or an interruption leaves what was there.
 
     Raises:
         OSError: if the file cannot be written; the message names it.
@@ -54,9 +54,12 @@ def write(path: str | Path, content: str | bytes) -> None:
     path = Path(path)
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        with partial.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
-        raise OSError(f"{path} could not be written: {error.strerror}") from error
+        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
     finally:
         partial.unlink(missing_ok=True)

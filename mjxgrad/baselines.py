@@ -83,7 +83,7 @@ def cross_entropy(
     stddev: ArrayLike | None = None,
     **options: Any,
 ) -> Optimisation:
-    r"""Minimise a cost by the cross-entropy method.
+    r"""Minimise a cost by the cross-entropy method; fields of the result about gradients are NaN.
 
     Every step draws candidates from $N(\mu, \mathrm{diag}\,\sigma^2)$ and fits $\mu$ and $\sigma$ to the `num_elite`
     best ones, by maximum likelihood (so $\sigma$ has no $n - 1$). A step with fewer finite ones is not taken.
@@ -98,9 +98,6 @@ def cross_entropy(
         stddev: the first $\sigma$, in the parameters' units; one number, or one per parameter. None takes the
             objective's noise, if it is on the parameters.
         **options: see `RunOptions`.
-
-    Returns:
-        The result, as in `optimise`, with NaN for fields about gradients.
 
     Raises:
         ValueError: if a number is out of range or does not fit, or as in `optimise`.

@@ -24,7 +24,7 @@ from mjxgrad.checking.motions import compiler_options
 from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.objective import Objective, parameter_noise
-from mjxgrad.tasks.ball_wall import WALL_CONTACT, BallWall, ball_wall
+from mjxgrad.tasks import WALL_CONTACT, BallWall, ball_wall
 
 # What MuJoCo gives a contact that says nothing: solref 0.02 1 and solimp 0.9 0.95 0.001.
 _DEFAULT = (1 / (0.02 * 1.0) ** 2, 1.0, (0.9, 0.95), 0.001)

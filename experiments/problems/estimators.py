@@ -1,20 +1,53 @@
-r"""Estimators to compare with, beside those of the library: REINFORCE with reward-to-go, and least squares."""
+r"""Estimators and rules to compare with, beside those of the library: REINFORCE with reward-to-go, least squares, DDCG."""
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from experiments.optimisation.settings import MethodSettings
 from mjxgrad.estimators import alpha_order, control_variate, first_order, zeroth_order
-from mjxgrad.estimators.estimate import GradientEstimate, assemble
+from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.estimators.rules import BiasConstrained, Concavity, Consistent, InverseVariance
+from mjxgrad.estimators.rules import BiasConstrained, Consistent, Evidence, Weights
 from mjxgrad.estimators.samples import Plan, check_baseline, sample
 from mjxgrad.objective import ActionNoise, Objective, OpenLoop, ParameterNoise, as_vector
 
 __all__ = ["alpha_order", "control_variate", "estimator", "first_order", "least_squares", "reinforce", "zeroth_order"]
+
+
+class InverseVariance(eqx.Module):
+    r"""$\alpha = V^0/(V^0 + V^1)$: least variance if both parts are independent, blind to bias."""
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        alpha = evidence.least_variance()
+        return Weights(alpha, Reason.inverse_variance, jnp.where(alpha > 0, jnp.nan, 0))
+
+
+class Concavity(eqx.Module):
+    r"""Inverse variance if $V^1 \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
+
+    A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. A cost with jumps has
+    too much variance for its derivatives.
+
+    Attributes:
+        slack: $c$.
+
+    References:
+        Onoda et al., arXiv:2604.18161 (DDCG), here with the noise of each coordinate in its own standard deviations.
+    """
+
+    slack: float = 0.3
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        needed = 2 * (1 - self.slack) * evidence.cost_variance - 2 * evidence.scaled_first_norm**2
+        is_smooth = evidence.scaled_first_variance >= needed
+        alpha = jnp.where(is_smooth, evidence.least_variance(), 0)
+        reason = Reason.where(is_smooth, Reason.inverse_variance, Reason.inconsistent)
+        return Weights(alpha, reason, jnp.where(alpha > 0, jnp.nan, 0))
+
 
 _RULES = {"consistent": Consistent, "inverse_variance": InverseVariance, "concavity": Concavity}
 

@@ -1,5 +1,3 @@
 """Arrays of many states: memory layouts, sums, small factorisations and GPU kernels, chosen per device. No physics."""
 
 from mjxgrad.batched.device import over_devices
-
-__all__ = ["over_devices"]

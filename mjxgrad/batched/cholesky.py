@@ -6,7 +6,7 @@ the batch. It is written out, or, where that would take long to compile, runs bl
 A CPU does not use LAPACK for batches: it takes one matrix after the other. With jaxlib before 0.11 its threads may deadlock.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,22 +48,13 @@ def _step_by_step(matrix: Float[Array, "n n batch"], vector: Float[Array, "n bat
     return jnp.moveaxis(jsl.cho_solve((factor, True), leading[1])[..., 0], -1, 0)
 
 
-@runtime_checkable
-class Operator(Protocol):
-    """A symmetric matrix, with its entries and as a map."""
-
-    @property
-    def matrix(self) -> Float[Array, "n n"]: ...
-
-    def apply(self, x: Float[Array, " n"]) -> Float[Array, " n"]: ...
-
-
 @jax.custom_jvp
-def solve_positive_definite(operator: Operator, vector: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve_positive_definite(operator: Any, vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return matrix⁻¹ vector, differentiable: derivatives are solves too and do not go through the factorisation.
 
-    Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. Derivatives go through the map, not through
-    the entries. The solution has the name `SOLUTION`, by which reverse mode can keep it.
+    The operator is a symmetric matrix: `operator.matrix` has its entries, and `operator.apply(x)` is the product, through which
+    derivatives go. Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. The solution has the name
+    `SOLUTION`, by which reverse mode can keep it.
     """
     return batch_last(cholesky_solve)(operator.matrix, vector)
 

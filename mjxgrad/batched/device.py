@@ -67,11 +67,8 @@ def _is_shared_out(context: mlir.LoweringRuleContext) -> bool:
 def over_devices(function: Callable[..., Any], *, num_shared: int = 0) -> Callable[..., Any]:
     """Return `jax.vmap(function)` whose batch is split evenly over all devices of the default platform.
 
-    The devices exchange nothing. With one device the result is `jax.vmap(function)`.
-
-    Args:
-        function: a function of one member of the batch; its arguments are pytrees of arrays with the batch as leading axis.
-        num_shared: number of leading arguments that all members share; they have no batch axis.
+    The devices exchange nothing. With one device the result is `jax.vmap(function)`. The arguments are pytrees of arrays with
+    the batch as leading axis; all members share the first `num_shared` of them, which have none.
 
     Raises:
         ValueError: when called with arguments without a common leading axis, or with one that the devices do not divide.

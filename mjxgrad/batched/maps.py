@@ -44,15 +44,13 @@ _MOST_FUSED = 4
 
 
 class Bilinear:
-    """The map c_k = Σ_ij T_kij a_i b_j along the last axis, for a constant T."""
+    """The map c_k = Σ_ij T_kij a_i b_j along the last axis, for a constant T; both factors have the same leading axes."""
 
     def __init__(self, table: np.ndarray):
-        """Keep the terms of T that are not zero."""
         self._size = len(table)
         self._terms = _ordered((*map(int, index), float(table[tuple(index)])) for index in np.argwhere(table))  # pyright: ignore[reportArgumentType]
 
     def __call__(self, a: Float[Array, "*n i"], b: Float[Array, "*n j"]) -> Float[Array, "*n k"]:
-        """Return c; both factors have the same leading axes."""
         return _bilinear.bind(a, b, terms=self._terms, size=self._size, batch=0)
 
 
@@ -227,7 +225,6 @@ def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
 
 
 def _entries(x: Array, index: np.ndarray, axis: int) -> Array:
-    """Return entries at constant places along an axis."""
     if np.array_equal(index, np.arange(x.shape[axis])):
         return x
     return jnp.take(x, index, axis=axis, mode="clip")
@@ -317,7 +314,6 @@ def _where_longer(count: np.ndarray) -> list[int]:
 
 
 def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
-    """Return sums of similar lengths."""
     is_term = rows != 0
     count = int(is_term.sum(axis=1).max(initial=0))
     if not 0 < count <= _MOST_GATHERED:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mjxgrad.batched import device, linear
 
 _Part = Float[Array, " 16"]
+_Vector = Float[Array, " width"]
 _Blocks = list[list[Any]]  # 16 by 16, None below the diagonal
 
 # Matrices are eliminated in blocks of so many columns: a program selects a row by a sum over the whole block.
@@ -158,7 +159,7 @@ def add_rows(matrix: _Blocks, left: Any, scale: Float[Array, " rows"], right: An
     return jax.lax.while_loop(lambda carry: carry[0] < len(scale), add_row, (after(jnp.int32(-1)), matrix))[1]
 
 
-def add_to_diagonal(matrix: _Blocks, vector: Float[Array, " width"]) -> _Blocks:
+def add_to_diagonal(matrix: _Blocks, vector: _Vector) -> _Blocks:
     """Return a matrix with a vector added to its diagonal."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
@@ -170,19 +171,17 @@ def add_to_diagonal(matrix: _Blocks, vector: Float[Array, " width"]) -> _Blocks:
     return _above(len(matrix), block)
 
 
-def diagonal(matrix: _Blocks) -> Float[Array, " width"]:
+def diagonal(matrix: _Blocks) -> _Vector:
     """Return the diagonal."""
     return join([_diagonal(matrix[b][b]) for b in range(len(matrix))])
 
 
-def solve_blocks(matrix: _Blocks, vector: Float[Array, " width"], size: int) -> Float[Array, " width"]:
+def solve_blocks(matrix: _Blocks, vector: _Vector, size: int) -> _Vector:
     """Return matrix⁻¹ vector, not finite where the matrix is not positive definite."""
     return join(_solve(matrix, [_part(vector, b) for b in range(len(matrix))], size))
 
 
-def solve_regularised(
-    matrix: _Blocks, vector: Float[Array, " width"], size: int, max_shift: float
-) -> Float[Array, " width"]:
+def solve_regularised(matrix: _Blocks, vector: _Vector, size: int, max_shift: float) -> _Vector:
     """Return matrix⁻¹ vector, with the smallest share of the diagonal added that makes the matrix positive definite."""
     found, own = solve_blocks(matrix, vector, size), diagonal(matrix)
     if not max_shift:
@@ -205,12 +204,12 @@ def next_share(share: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.maximum(4 * share, float(jnp.finfo(share.dtype).eps))
 
 
-def is_finite(vector: Float[Array, " width"]) -> Bool[Array, ""]:
+def is_finite(vector: _Vector) -> Bool[Array, ""]:
     """Return whether all entries are finite."""
     return (~(jnp.abs(vector) < jnp.inf)).astype(jnp.int32).sum() == 0
 
 
-def join(parts: list[_Part]) -> Float[Array, " width"]:
+def join(parts: list[_Part]) -> _Vector:
     """Return a vector from its parts."""
     if len(parts) == 1:
         return parts[0]
@@ -218,7 +217,7 @@ def join(parts: list[_Part]) -> Float[Array, " width"]:
     return linear.add(jnp.where(_is_part(index, b), part[None], 0.0).sum(axis=1) for b, part in enumerate(parts))
 
 
-def _part(vector: Float[Array, " width"], number: int) -> _Part:
+def _part(vector: _Vector, number: int) -> _Part:
     if len(vector) == _BLOCK:
         return vector
     index = jnp.arange(len(vector), dtype=jnp.int32)[:, None]

@@ -24,15 +24,12 @@ _SLIDING = 2
 
 
 def set_const(model: mjx.Model) -> mjx.Model:
-    """Return the model with the constants that follow from its masses, inertias, lengths and sizes.
+    """Return a model of MJX's JAX implementation with the constants that follow from masses, inertias, lengths and sizes.
 
     The constants are `body_subtreemass`, `body_invweight0`, `dof_invweight0`, `dof_M0`, `tendon_invweight0`, `tendon_length0`,
     `actuator_acc0` and, for primitive geoms, `geom_rbound`. The function is traceable, differentiable with respect to all that
     they depend on, and works under `jax.vmap`. Masses and inertias are inputs here, although MuJoCo's compiler may derive them
     from a geom's size or density: a changed size changes no mass.
-
-    Args:
-        model: a model of MJX's JAX implementation.
     """
     return model.replace(**constants_of(model))  # pyright: ignore[reportReturnType]
 

@@ -13,7 +13,6 @@ References:
 """
 
 import dataclasses
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +28,8 @@ from mjxgrad.bodies.orientation import orientation
 
 _Position = Float[Array, " nq"]
 _Vector = Float[Array, " nv"]
+_Duration = Float[Array, ""] | float
+_Index = Int[np.ndarray, " _"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _UP = np.array([0.0, 0.0, 1.0])
@@ -249,17 +250,15 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
     return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
 
 
-def integrate_position(
-    model: mjx.Model, qpos: _Position, qvel: _Vector, duration: Float[Array, ""] | float
-) -> _Position:
+def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duration: _Duration) -> _Position:
     """Return the position after a duration (s) at constant joint velocity; quaternions turn in their own frame."""
-    places = _places(model)
-    if not places.quaternions.size:
+    dof, entry, quaternions, turns = _places(model)
+    if not quaternions.size:
         return qpos + duration * qvel
-    moved = qpos + duration * pick(places.dof, qvel)
-    turn = spatial.exponential(duration * pick(places.turns, qvel).reshape(-1, 3))
-    turned = spatial.normalise(spatial.multiply(pick(places.quaternions, qpos).reshape(-1, 4), turn))
-    return jnp.where(places.entry < 0, moved, pick(places.entry, turned.reshape(-1)))
+    moved = qpos + duration * pick(dof, qvel)
+    turn = spatial.exponential(duration * pick(turns, qvel).reshape(-1, 3))
+    turned = spatial.normalise(spatial.multiply(pick(quaternions, qpos).reshape(-1, 4), turn))
+    return jnp.where(entry < 0, moved, pick(entry, turned.reshape(-1)))
 
 
 def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
@@ -267,31 +266,20 @@ def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vect
 
     The inverse of `integrate_position`.
     """
-    places = _places(model)
-    if not places.quaternions.size:
+    dof, _, quaternions, turns = _places(model)
+    if not quaternions.size:
         return end - start
-    before, after = (pick(places.quaternions, x).reshape(-1, 4) for x in (start, end))
+    before, after = (pick(quaternions, x).reshape(-1, 4) for x in (start, end))
     turned = spatial.logarithm(spatial.multiply(spatial.conjugate(before), after)).reshape(-1)
-    return pick(_inverse(places.dof, model.nv), end - start) + pick(_inverse(places.turns, model.nv), turned)
+    return pick(_inverse(dof, model.nv), end - start) + pick(_inverse(turns, model.nv), turned)
 
 
-class _Places(NamedTuple):
-    """Index arrays between coordinates, joint velocities and quaternions; -1 for none.
+def _places(model: mjx.Model) -> tuple[_Index, _Index, _Index, _Index]:
+    """Return index arrays between coordinates, joint velocities and entries of quaternions; -1 for none.
 
-    Attributes:
-        dof: joint velocity that adds to each coordinate.
-        entry: place of each coordinate among the entries of quaternions.
-        quaternions: coordinates of the entries of quaternions.
-        turns: joint velocities of ball joints and of the rotations of free joints.
+    They are the joint velocity that adds to each coordinate, the place of each coordinate among the entries of quaternions, the
+    coordinates of these entries, and the joint velocities of ball joints and of the rotations of free joints.
     """
-
-    dof: Int[np.ndarray, " nq"]
-    entry: Int[np.ndarray, " nq"]
-    quaternions: Int[np.ndarray, " entries"]
-    turns: Int[np.ndarray, " dofs"]
-
-
-def _places(model: mjx.Model) -> _Places:
     dof, quaternions, turns = np.full(model.nq, -1), [], []
     for kind, address, first in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
         is_free = kind == _Joint.mjJNT_FREE
@@ -304,10 +292,10 @@ def _places(model: mjx.Model) -> _Places:
         else:
             dof[address] = first
     quaternions, turns = np.array(quaternions, int), np.array(turns, int)
-    return _Places(dof, _inverse(quaternions, model.nq), quaternions, turns)
+    return dof, _inverse(quaternions, model.nq), quaternions, turns
 
 
-def _inverse(index: Int[np.ndarray, " n"], size: int) -> Int[np.ndarray, " size"]:
+def _inverse(index: _Index, size: int) -> _Index:
     """Return the position of each place in an index, -1 where it is missing."""
     inverse = np.full(size, -1)
     inverse[index[index >= 0]] = np.flatnonzero(index >= 0)

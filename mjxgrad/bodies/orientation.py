@@ -27,6 +27,7 @@ from mjxgrad.batched import linear, maps
 from mjxgrad.batched.maps import contract, pick
 from mjxgrad.bodies import spatial, tree
 
+_Turns = Float[Array, "njnt 4"]
 _Vectors = Float[Array, "n 3"]
 _Matrices = Float[Array, "n 3 3"]
 _Joint = mujoco.mjtJoint
@@ -95,28 +96,17 @@ class Angles(eqx.Module):
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """Constants of chains that turn about one axis each.
+    """Constants of chains that turn about one axis each, for each turn."""
 
-    Attributes:
-        sums: coefficients 0 or ±1 of the joints' angles in φ (turns, joints).
-        even: (1 - a aᵀ) C of each turn.
-        odd: [a]ₓ C.
-        constant: a aᵀ C.
-        quaternion: quaternion of C.
-        turned_quaternion: (0, a) times the quaternion of C.
-    """
-
-    sums: np.ndarray
-    even: np.ndarray
-    odd: np.ndarray
-    constant: np.ndarray
-    quaternion: np.ndarray
-    turned_quaternion: np.ndarray
+    sums: np.ndarray  # coefficients 0 or ±1 of the joints' angles in φ
+    even: np.ndarray  # (1 - a aᵀ) C
+    odd: np.ndarray  # [a]ₓ C
+    constant: np.ndarray  # a aᵀ C
+    quaternion: np.ndarray  # the quaternion of C
+    turned_quaternion: np.ndarray  # (0, a) times the quaternion of C
 
 
-def orientation(
-    model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]
-) -> Products | Angles:
+def orientation(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: _Turns) -> Products | Angles:
     """Return the orientations after all turns, from the quaternion of each joint."""
     found = chains(model, frames)
     if found is None:
@@ -127,7 +117,7 @@ def orientation(
     return Angles(maps.combine(found.sums[:, hinges], angles), found)
 
 
-def _products(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: Float[Array, "njnt 4"]) -> Products:
+def _products(model: mjx.Model, data: mjx.Data, frames: tree.Frames, turn: _Turns) -> Products:
     has_joint = frames.joint >= 0
     own = pick(frames.joint, turn, _IDENTITY * (frames.mocap < 0)[:, None])
     if model.nmocap:

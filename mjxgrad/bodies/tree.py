@@ -17,44 +17,30 @@ _SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 
 @dataclass(frozen=True)
 class Run:
-    """Neighbouring joints of one type. Their coordinates are contiguous, so a slice and a reshape gather them.
-
-    `width` is the number of positions per joint.
-    """
+    """Neighbouring joints of one type. Their coordinates are contiguous, so a slice and a reshape gather them."""
 
     kind: mujoco.mjtJoint
     joints: slice
     qpos: slice
-    width: int
+    width: int  # positions per joint
 
 
 @dataclass(frozen=True)
 class Frames:
     """Turns that compose the orientations of bodies: one for each rotating joint, one for each body without such a joint.
 
-    An index of -1 stands for the world.
-
-    Attributes:
-        body: body whose own quaternion a turn includes, -1 for none (turns -> bodies).
-        joint: joint of a turn, -1 for none (turns -> joints).
-        mocap: mocap body of a turn, -1 for none (turns -> mocap).
-        jumps: for k = 0, 1, ... the turn 2ᵏ places before each; multiplied in order they give the product from the root.
-        of_body: last turn of a body.
-        before_body: turn that a body's position refers to.
-        before_joint: turn that a joint's position and axis refer to.
-        is_first: whether a joint is the first of its body to rotate, so that the body's quaternion applies.
-        after_joint: turn of a joint that moves its body about its anchor, -1 for other joints.
+    An index of -1 stands for the world, or for none.
     """
 
-    body: np.ndarray
-    joint: np.ndarray
-    mocap: np.ndarray
-    jumps: tuple[np.ndarray, ...]
-    of_body: np.ndarray
-    before_body: np.ndarray
-    before_joint: np.ndarray
-    is_first: np.ndarray
-    after_joint: np.ndarray
+    body: np.ndarray  # the body whose own quaternion a turn includes
+    joint: np.ndarray  # the joint of a turn
+    mocap: np.ndarray  # the mocap body of a turn
+    jumps: tuple[np.ndarray, ...]  # the turns 2ᵏ places before; multiplied in order they give the product from the root
+    of_body: np.ndarray  # the last turn of a body
+    before_body: np.ndarray  # the turn that a body's position refers to
+    before_joint: np.ndarray  # the turn that a joint's position and axis refer to
+    is_first: np.ndarray  # whether a joint is the first of its body to rotate, so that the body's quaternion applies
+    after_joint: np.ndarray  # the turn of a joint that moves its body about its anchor
 
 
 def joint_runs(model: mjx.Model) -> tuple[Run, ...]:

@@ -11,7 +11,7 @@ from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured
 from mjxgrad.checking.motions import REFINED, Motions
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
-from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
+from mjxgrad.rollouts.state import LARGEST_GROWTH
 from mjxgrad.scene import Scene
 
 Kind = Literal[

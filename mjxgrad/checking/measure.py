@@ -51,46 +51,27 @@ _REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: a hundred sample
 
 @dataclass(frozen=True)
 class Line:
-    """Motions along a line through one of the random motions.
+    """Motions along a line through one of the random motions."""
 
-    Attributes:
-        pose: name of the initial pose.
-        varied: description of the change along the line.
-        plain: slope and derivatives of MuJoCo's motion, by kind.
-        fine: slope of the motion at a much shorter time step, beside the same derivatives.
-        jumps: jumps of the fine motion, over its spread; the parameter is the place on the line.
-        changed: pairs that touch only on one side of the jumps.
-        growth: growth of a change of the start, by time; NaN where only controls are changed.
-        num_diverged: number of motions that diverged.
-    """
-
-    pose: str
-    varied: str
-    plain: SlopeComparison
-    fine: SlopeComparison
-    jumps: Jumps
-    changed: tuple[str, ...]
-    growth: Float[np.ndarray, " times"]
-    num_diverged: int
+    pose: str  # name of the initial pose
+    varied: str  # description of the change along the line
+    plain: SlopeComparison  # slope and derivatives of MuJoCo's motion, by kind
+    fine: SlopeComparison  # slope of the motion at a much shorter time step, beside the same derivatives
+    jumps: Jumps  # jumps of the fine motion, over its spread; the parameter is the place on the line
+    changed: tuple[str, ...]  # pairs that touch only on one side of the jumps
+    growth: Float[np.ndarray, " times"]  # growth of a change of the start, by time; NaN where only controls are changed
+    num_diverged: int  # number of motions that diverged
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Both estimates of the derivative along one direction, with noise on all controls or initial velocities.
+    """Both estimates of the derivative along one direction, with noise on all controls or initial velocities."""
 
-    Attributes:
-        stddev: standard deviation, see `STDDEVS`.
-        stiffness: stiffness of all contacts in 1/s²; None is the file's.
-        first: first-order estimates by single motions.
-        zeroth: zeroth-order estimates by the same motions.
-        crossover: the time from which zeroth order is at least as good, in s.
-    """
-
-    stddev: float
-    stiffness: float | None
-    first: Float[np.ndarray, "motions times outcomes"]
-    zeroth: Float[np.ndarray, "motions times outcomes"]
-    crossover: float
+    stddev: float  # standard deviation, see `STDDEVS`
+    stiffness: float | None  # stiffness of all contacts in 1/s²; None is the file's
+    first: Float[np.ndarray, "motions times outcomes"]  # first-order estimates by single motions
+    zeroth: Float[np.ndarray, "motions times outcomes"]  # zeroth-order estimates by the same motions
+    crossover: float  # the time from which zeroth order is at least as good, in s
 
     @property
     def advantage(self) -> float:

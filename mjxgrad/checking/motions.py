@@ -59,33 +59,19 @@ class Touch:
 
 @dataclass(frozen=True)
 class Motions:
-    """Random motions from the poses of a scene, by C MuJoCo.
+    """Random motions from the poses of a scene, by C MuJoCo; states are those before each step and after the last."""
 
-    Attributes:
-        poses: names of the initial poses.
-        qpos: positions before each step and after the last.
-        qvel: velocities at the same times.
-        act: activations at the same times.
-        controls: controls of each step.
-        timestep: time step of the scene, in s.
-        bad_steps: for each motion the first step that is not finite or too fast, −1 if there is none.
-        onsets: for each motion the step of the first new touch, −1 if there is none.
-        touches: pairs that begin to touch, in order of time.
-        touching: pairs in contact from the first step on.
-        idle: actuators whose control has no effect.
-    """
-
-    poses: tuple[str, ...]
+    poses: tuple[str, ...]  # names of the initial poses
     qpos: Float[np.ndarray, "motions states nq"]
     qvel: Float[np.ndarray, "motions states nv"]
     act: Float[np.ndarray, "motions states na"]
     controls: Float[np.ndarray, "motions steps nu"]
-    timestep: float
-    bad_steps: Int[np.ndarray, " motions"]
-    onsets: Int[np.ndarray, " motions"]
-    touches: tuple[Touch, ...]
-    touching: tuple[str, ...]
-    idle: tuple[str, ...]
+    timestep: float  # time step of the scene, in s
+    bad_steps: Int[np.ndarray, " motions"]  # first step that is not finite or too fast, −1 if there is none
+    onsets: Int[np.ndarray, " motions"]  # step of the first new touch, −1 if there is none
+    touches: tuple[Touch, ...]  # pairs that begin to touch, in order of time
+    touching: tuple[str, ...]  # pairs in contact from the first step on
+    idle: tuple[str, ...]  # actuators whose control has no effect
 
     @property
     def touch_speed(self) -> float:

@@ -65,14 +65,9 @@ class _Axis(NamedTuple):
 
 
 def box_box(first: Box, second: Box) -> tuple[Float[Array, "8"], Float[Array, "8 3"], Float[Array, "8 3 3"]]:
-    """Return the contacts of two boxes.
+    """Return the contacts of two boxes: distances (m; `ABSENT` in slots that are not used), positions (m), and frames.
 
-    Args:
-        first: the box that the normals point away from.
-        second: the other box.
-
-    Returns:
-        Distances (m; `ABSENT` in slots that are not used), positions (m), and frames with normals as their first rows.
+    The first rows of frames are normals, which point away from the first box.
     """
     turn = _product(first.axes.T, second.axes)
     ways = _product(first.axes.T, second.centre - first.centre), _product(second.axes.T, first.centre - second.centre)

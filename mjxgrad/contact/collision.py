@@ -221,7 +221,6 @@ def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.F
 
 
 def _box_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return contacts of boxes; see `boxes`."""
     first, second = (
         boxes.Box(pick(geom, data.geom_xpos), pick(geom, data.geom_xmat), pick(geom, model.geom_size))
         for geom in geoms.T

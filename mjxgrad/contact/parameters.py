@@ -45,8 +45,10 @@ class ContactPair:
     names: tuple[str, str]
 
     def __str__(self) -> str:
-        """Return the two names as printed in messages."""
         return " – ".join(self.names)
+
+
+Pairs = tuple[ContactPair, ...]
 
 
 class ContactParameters(eqx.Module):
@@ -77,14 +79,9 @@ class ContactParameters(eqx.Module):
     timestep: Float[Array, "*batch"]
 
     @property
-    def natural_frequency(self) -> Float[Array, "*batch pairs"]:
-        r"""$\omega_0 = \sqrt k$, in rad/s."""
-        return safe_sqrt(self.stiffness)
-
-    @property
     def damping_ratio(self) -> Float[Array, "*batch pairs"]:
         r"""$b / (2 \sqrt k)$; infinite without stiffness."""
-        return self.damping / (2.0 * self.natural_frequency)
+        return self.damping / (2.0 * safe_sqrt(self.stiffness))
 
     @property
     def stability(self) -> Float[Array, "*batch pairs"]:
@@ -95,9 +92,8 @@ class ContactParameters(eqx.Module):
     def rest_depth(self, acceleration: Float[ArrayLike, ""]) -> Float[Array, "*batch pairs"]:
         """Return the depth at rest below the distance at which contact begins (m); $(1 - d_w) a_0 / k$ for constant impedance.
 
-        Args:
-            acceleration: the acceleration $a_0$ at which the bodies would approach without contact, in m/s². For one body on
-                the ground it is gravity, for a stack of n equal ones n times that. `contact.law` says when this is exact.
+        Without contact the bodies would approach at the acceleration $a_0$ (m/s²). For one body on the ground it is gravity, for
+        a stack of n equal ones n times that. `contact.law` says when this is exact.
         """
         return rest_depth(self.pyramid * acceleration, self.stiffness, self.solimp)
 
@@ -113,7 +109,7 @@ def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
     return mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{of_body}[{geom - int(model.body_geomadr[body])}]"
 
 
-def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
+def contact_pairs(model: mjx.Model | mujoco.MjModel) -> Pairs:
     """List the pairs of geoms that MJX tests for contact, in no particular order; none if contacts are disabled.
 
     Only the static structure of the model is read.
@@ -129,9 +125,7 @@ def contact_pairs(model: mjx.Model | mujoco.MjModel) -> tuple[ContactPair, ...]:
     return tuple(pairs)
 
 
-def named_pairs(
-    pairs: tuple[ContactPair, ...], wanted: tuple[tuple[str, str], ...], what: str
-) -> tuple[ContactPair, ...]:
+def named_pairs(pairs: Pairs, wanted: tuple[tuple[str, str], ...], what: str) -> Pairs:
     """Return the pairs with these names, in the order of `pairs`; refuse unknown names in a message about `what`."""
     known = {frozenset(pair.names) for pair in pairs}
     for names in wanted:
@@ -155,7 +149,7 @@ def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[i
 
 # Compiled as one program: one operation after another takes seconds for the first scene of a kind.
 @eqx.filter_jit
-def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None = None) -> ContactParameters:
+def contact_parameters(model: mjx.Model, pairs: Pairs | None = None) -> ContactParameters:
     """Compute the effective parameters of pairs, one row each; by default of all that can touch.
 
     Differentiable with respect to the model's leaves, and traceable.
@@ -177,7 +171,7 @@ def contact_parameters(model: mjx.Model, pairs: tuple[ContactPair, ...] | None =
     )
 
 
-def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: Array) -> Array:
+def _pyramid_factor(model: mjx.Model, pairs: Pairs, friction: Array) -> Array:
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return jnp.ones_like(friction)
     condim = np.array([pair.condim for pair in pairs], dtype=int)
@@ -185,7 +179,7 @@ def _pyramid_factor(model: mjx.Model, pairs: tuple[ContactPair, ...], friction: 
     return jnp.where(condim > 1, factor, 1.0)
 
 
-def _mix(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> tuple[Array, ...]:
+def _mix(model: mjx.Model, pairs: Pairs) -> tuple[Array, ...]:
     """Combine the parameters of two geoms by MuJoCo's rules."""
     numbers = [(pair.geom1, pair.geom2, pair.explicit) for pair in pairs]
     geom1, geom2, explicit = np.array(numbers, dtype=int).reshape(-1, 3).T

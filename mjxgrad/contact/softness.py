@@ -23,13 +23,13 @@ from mjxgrad.contact.law import compensated_stiffness
 from mjxgrad.contact.parameters import (
     ContactPair,
     ContactParameters,
+    Pairs,
     contact_pairs,
     contact_parameters,
     deciding_geoms,
     named_pairs,
 )
 
-_Pairs = tuple[ContactPair, ...]
 # Plain integers: NumPy's integers do not equal MuJoCo's enumerations.
 _WITHOUT_MARGIN = (mujoco.mjtGeom.mjGEOM_MESH.value, mujoco.mjtGeom.mjGEOM_HFIELD.value)
 _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
@@ -51,9 +51,8 @@ class Softness(eqx.Module):
 
     A margin moves the start of the force away from the surface, and with it the place of rest: bodies hover by the margin less
     their depth. `rest_acceleration` restores the height, exactly under one load, by a softer spring:
-    $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). Two other ways fail. Geoms that shrink by
-    the margin cancel it, since a margin only enlarges geoms. A lower impedance reaches $d = 0$ where $k m > a_0$. But under a
-    softer spring n times the load sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
+    $k' = (1 - d) a_0 / (m + \rho_0)$ for constant impedance (`contact.law` for any). But under a softer spring n times the load
+    sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
 
     A part that is `None` stays as it is in the model. If only one of stiffness and damping ratio is given, the other keeps its
     present effective value. Every part is a leaf of a pytree, so that a sweep is one `jax.vmap` over a `Softness` with a
@@ -81,7 +80,6 @@ class Softness(eqx.Module):
     pairs: tuple[tuple[str, str], ...] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        """Refuse several subsets at once, a height without a margin, and values out of their range if they are known."""
         if self.geoms is not None and self.pairs is not None:
             raise ValueError("Softness takes either geoms or pairs, got geoms and pairs")
         if isinstance(self.geoms, str):
@@ -93,7 +91,7 @@ class Softness(eqx.Module):
             if is_known(value) and not np.all(is_valid(np.asarray(value))):
                 raise ValueError(f"{name} must be {requirement}, got {np.asarray(value).tolist()}")
 
-    def selected(self, model: mjx.Model) -> tuple[ContactPair, ...]:
+    def selected(self, model: mjx.Model) -> Pairs:
         """Return the pairs that this softness changes; all pairs without a subset.
 
         Raises:
@@ -163,7 +161,7 @@ class Softness(eqx.Module):
                 parts[name] = jnp.where(is_valid(value), value, jnp.nan)
         return dataclasses.replace(self, **parts)
 
-    def _solref(self, model: mjx.Model, pairs: tuple[ContactPair, ...], before: ContactParameters) -> Array:
+    def _solref(self, model: mjx.Model, pairs: Pairs, before: ContactParameters) -> Array:
         """Return solref in the direct format for each pair; the model has the other parts already."""
         refuse = functools.partial(_refuse_disagreement, model, pairs)
         stiffness, damping_ratio = self.stiffness, self.damping_ratio
@@ -199,7 +197,7 @@ class Softness(eqx.Module):
         return solimp
 
 
-def _with_margin(model: mjx.Model, margin: Array, pairs: _Pairs, explicit: list[int]) -> mjx.Model:
+def _with_margin(model: mjx.Model, margin: Array, pairs: Pairs, explicit: list[int]) -> mjx.Model:
     """Write the margin to explicit pairs, and half of it to each geom of other pairs, since MuJoCo adds the two."""
     for pair in pairs:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
@@ -227,9 +225,7 @@ def _summed_geoms(pair: ContactPair) -> tuple[int, ...]:
     return () if pair.explicit >= 0 else (pair.geom1, pair.geom2)
 
 
-def _refuse_shared_geoms(
-    model: mjx.Model, selected: _Pairs, geoms_of: Callable[[ContactPair], tuple[int, ...]]
-) -> None:
+def _refuse_shared_geoms(model: mjx.Model, selected: Pairs, geoms_of: Callable[[ContactPair], tuple[int, ...]]) -> None:
     """Refuse to change pairs whose geoms also determine the contacts of other pairs."""
     decided_by = {geom: pair for pair in selected for geom in geoms_of(pair)}
     chosen = set(selected)
@@ -244,7 +240,7 @@ def _refuse_shared_geoms(
                 )
 
 
-def _refuse_disagreement(model: mjx.Model, selected: _Pairs, values: Array, part: str, remedy: str) -> None:
+def _refuse_disagreement(model: mjx.Model, selected: Pairs, values: Array, part: str, remedy: str) -> None:
     """Refuse different known values for pairs that share a geom; traced values are not checked."""
     if not is_known(values):
         return

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
 from mjxgrad._text import format_number, name_pairs
-from mjxgrad.contact.parameters import ContactPair, contact_pairs, contact_parameters
+from mjxgrad.contact.parameters import ContactPair, Pairs, contact_pairs, contact_parameters
 from mjxgrad.contact.softness import Softness
 
 _ABOVE_NOTHING = 1e-6  # m; bodies that hover by less are taken to touch
@@ -37,7 +37,7 @@ def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) 
     return stable
 
 
-def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[str]:
+def contact_warnings(model: mjx.Model, pairs: Pairs) -> list[str]:
     """Return warnings about contacts that `refsafe` alters or that are too stiff for the time step; values must be known."""
     if not pairs:
         return []
@@ -57,7 +57,7 @@ def contact_warnings(model: mjx.Model, pairs: tuple[ContactPair, ...]) -> list[s
     return _grouped(found)
 
 
-def contact_differences(model: mujoco.MjModel, pairs: tuple[ContactPair, ...]) -> list[str]:
+def contact_differences(model: mujoco.MjModel, pairs: Pairs) -> list[str]:
     """Return one sentence per kind of pair for which MJX and C MuJoCo find different contact points."""
     geom = mujoco.mjtGeom
     kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
@@ -132,9 +132,7 @@ def softness_warnings(softness: Softness, model: mjx.Model) -> list[str]:
     return messages
 
 
-def _hovering(
-    softness: Softness, model: mjx.Model, pairs: tuple[ContactPair, ...]
-) -> Iterator[tuple[ContactPair, str]]:
+def _hovering(softness: Softness, model: mjx.Model, pairs: Pairs) -> Iterator[tuple[ContactPair, str]]:
     gravity = float(np.linalg.norm(np.asarray(model.opt.gravity)))
     parameters = contact_parameters(model, pairs)
     is_single = np.asarray(parameters.margin).ndim == 1 and np.all(np.asarray(parameters.stiffness) > 0)

@@ -71,13 +71,9 @@ class Landscape(eqx.Module):
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the gradient of the smoothed cost, and its standard error.
 
-        The point `params` must lie at least `REACH` standard deviations inside the landscape. The standard error errs on the
-        large side. Both are NaN if a cost with weight is not finite.
-
-        Args:
-            params: the parameter at which the gradient is taken.
-            stddev: standard deviation of the noise.
-            centre: the baseline cost, such as the cost at `params`; it must not be one of these costs.
+        The point `params` must lie at least `REACH` standard deviations of the noise inside the landscape. The baseline
+        `centre`, such as the cost at `params`, must not be one of these costs. Both results are NaN if a cost with weight is
+        not finite.
         """
         offset = (self.points - params) / stddev
         weight = offset / stddev * jax.scipy.stats.norm.pdf(offset) / stddev
@@ -291,15 +287,11 @@ def bias_variance(
         compiler_options: options for XLA.
         progress: called after every softness with the number done and the total.
 
-    Returns:
-        The measurements.
-
     Raises:
         ValueError: if `params` is not a matrix, `softness` has no or unequal leading axes, or a number is out of range.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, section 3 (bias) and figure 4 (variance against stiffness).
+        Suh, Simchowitz, Zhang, Tedrake. ICML 2022, arXiv:2202.00817, section 3 (bias), figure 4 (variance against stiffness).
     """
     if jnp.ndim(params) != 2:
         raise ValueError(

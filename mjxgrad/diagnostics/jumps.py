@@ -62,9 +62,6 @@ def jumps_along(
         num_refinements: number of rounds; each divides the intervals into `num_points / num_candidates + 1` parts.
         smallest: smallest jump that counts, as a share of the largest value on the grid.
 
-    Returns:
-        The jumps.
-
     Raises:
         ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` and at least two,
             `num_refinements` is below 1, or the function does not return one value per parameter.

@@ -110,16 +110,9 @@ def compare_to_slope(
     derivatives: Sequence[ArrayLike],
     gradients: Sequence[str] = ("discrete", "slope"),
 ) -> SlopeComparison:
-    """Compare given derivatives with the slope of given outcomes.
+    """Compare given derivatives, for each named gradient one per outcome, with the slope of the outcomes.
 
-    Args:
-        parameters: the parameters, increasing and about evenly spaced, as `phases` returns them.
-        outcomes: the outcome at each parameter.
-        derivatives: for each gradient, one per outcome.
-        gradients: names of the gradients.
-
-    Returns:
-        Slope, means and their errors.
+    The parameters increase and are about evenly spaced, as `phases` returns them.
 
     Raises:
         ValueError: if shapes do not fit, parameters do not increase or there are fewer than 32.

@@ -271,17 +271,10 @@ def _warnings_at(speed: float, spring: Spring) -> Iterator[str]:
 
 
 def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityReport:
-    """Check whether the time step of a scene resolves its contacts, limits and equalities.
+    """Check whether the time step of a scene resolves its contacts, limits and equalities; `print` the report.
 
-    Nothing is simulated. The limits are those of a single spring and damper, see this module.
-
-    Args:
-        scene: a scene with known values.
-        speed: speed at which geoms approach each other, in m/s. Passing through, depth and onsets depend on it and are
-            checked only where it is given.
-
-    Returns:
-        The report: `print` it, or read its `warnings`.
+    Nothing is simulated. The limits are those of a single spring and damper, see this module. Passing through, depth and onsets
+    depend on the speed at which geoms approach each other (m/s), and are checked only where it is given.
 
     Raises:
         ValueError: if the speed is not positive, or the scene is batched or traced.

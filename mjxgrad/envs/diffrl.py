@@ -17,7 +17,7 @@ from mjxgrad.bodies.spatial import exponential, multiply, rotation_matrix
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
-from mjxgrad.tasks.action_task import robot_scene, scene_path
+from mjxgrad.tasks import robot_scene, scene_path
 
 Memory = dict[str, Float[Array, "..."]]
 _TILT = jnp.pi / 24  # rad, largest tilt of a floating base at the start
@@ -132,8 +132,7 @@ def cartpole() -> CartPole:
 def hopper(*, num_substeps: int = 4) -> Planar:
     """Return the hopper; an episode is over when the torso is 0.45 m below its reference height.
 
-    Args:
-        num_substeps: time steps per action, together 1/60 s; stiffer contact needs more.
+    An action has `num_substeps` time steps, together 1/60 s; stiffer contact needs more.
     """
     return Planar(_scene("hopper", num_substeps), frame_skip=num_substeps, fallen=-0.45)
 

@@ -98,11 +98,7 @@ class Environment(InScene):
     def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: PyTree) -> Rewards:
         """Return the terms of the reward of one step; the reward is their sum.
 
-        Args:
-            before: state in which the action was chosen.
-            action: the action, clipped to −1 and 1.
-            after: state after the action.
-            memory: memory when the action was chosen.
+        The action, clipped to −1 and 1, was chosen in the state `before` with this memory.
         """
 
     def start(self, key: PRNGKeyArray) -> State:
@@ -147,11 +143,7 @@ class Environment(InScene):
         return self.frame_skip * self.scene.model.opt.timestep
 
     def reset(self, key: PRNGKeyArray) -> EnvState:
-        """Begin an episode.
-
-        Args:
-            key: consumed here; it decides all draws until the next reset.
-        """
+        """Begin an episode; the key is consumed, and decides all draws until the next reset."""
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
         obs = self.observe(physics, memory)

@@ -58,12 +58,10 @@ class GymEnv(_Adapter, gymnasium.Env):
     metadata = _METADATA
 
     def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **view: Any):
-        """Prepare an environment; nothing is compiled before `reset` and `step`.
+        """Prepare an environment, or one of `mjxgrad.envs.ENVIRONMENTS` by name; nothing is compiled before `reset` and `step`.
 
-        Args:
-            environment: the environment, or its name in `mjxgrad.envs.ENVIRONMENTS`.
-            render_mode: "rgb_array" or None.
-            view: `height`, `width` and `camera` of `mjxgrad.render.frames`. By default the scene's first camera, if any.
+        The render mode is "rgb_array" or None. The view is `height`, `width` and `camera` of `mjxgrad.render.frames`, by default
+        the scene's first camera, if any.
 
         Raises:
             ValueError: if there is no such environment or render mode.

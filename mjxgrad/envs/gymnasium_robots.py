@@ -16,7 +16,7 @@ from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.rollouts.state import data_of
-from mjxgrad.tasks.action_task import robot_scene
+from mjxgrad.tasks import robot_scene
 
 _ANY = (-float("inf"), float("inf"))
 

@@ -27,13 +27,8 @@ def load(
     """Load an environment of MuJoCo Playground, to be stepped by `mg.step`.
 
     The object is Playground's own and works with its wrappers and randomisers. Its motion is Playground's with a converged
-    solver, unless `contact` changes it.
-
-    Args:
-        name: name for `registry.load`, for instance "CartpoleSwingup".
-        config_overrides: values by flattened name; `impl` is always "jax", the implementation that has derivatives.
-        contact: see `stepped_right`.
-        iterations: see `stepped_right`.
+    solver, unless `contact` changes it. The name, such as "CartpoleSwingup", is that of `registry.load`. The overrides are
+    values by flattened name; `impl` is always "jax", which has derivatives. All else is as in `stepped_right`.
 
     Raises:
         ImportError: if playground is not installed.
@@ -49,7 +44,7 @@ def load(
 
 
 def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterations: int = 100) -> Foreign:
-    """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`.
+    """Replace `mjx.step` by `mg.step` in an object's `reset` and `step`, and return the object.
 
     Args:
         environment: an object with these methods on MJX's JAX implementation: from Playground, from brax's backend "mjx", or
@@ -57,9 +52,6 @@ def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterat
         contact: how contact is stepped, see `mg.step`.
         iterations: least limit on the solver's iterations; it stops at the model's tolerance. Many of their models stop after
             1 to 4, where the solve's derivative is not yet that of the motion.
-
-    Returns:
-        The same object.
 
     Raises:
         ValueError: if contact does not suit `mg.step`.

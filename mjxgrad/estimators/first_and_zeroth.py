@@ -73,9 +73,8 @@ def zeroth_order(
         ValueError: as `first_order`; also if `num_samples` is odd, or `baseline` unknown.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, definition 2.3 (there with the zero-noise baseline). Kool, van Hoof, Welling. Buy 4 REINFORCE
-        samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
+        Definition 2.3 in the reference of `first_order` (there with the zero-noise baseline). Kool, van Hoof, Welling. Buy 4
+        REINFORCE samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
     objective, vector, restore = as_vector(objective, params)
     check_baseline(baseline)

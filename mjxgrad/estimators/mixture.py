@@ -44,8 +44,7 @@ def alpha_order(
         ValueError: if `num_samples` or `chunk_size` do not fit, or the objective does not know its noise.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, section 4 (the mixture).
+        Suh, Simchowitz, Zhang, Tedrake. ICML 2022, arXiv:2202.00817, section 4 (the mixture); see `first_order`.
     """
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
@@ -83,30 +82,19 @@ def control_variate(
 
 
 class Parts(eqx.Module):
-    """Moments of both parts over all units: samples, or pairs where starts are random.
-
-    Attributes:
-        difference: moments of the unbiased terms minus the derivatives.
-        scaled: moments of the derivatives by the noise, in its standard deviations.
-        secants: comparison of costs and derivatives over pairs.
-        linear_variance: variance of the costs that the mean derivative explains, summed over samples.
-        beta: sum of the shares of the linear part that were taken off.
-        num_costs: number of samples in the last two sums.
-        num_groups: number of groups of samples that share their baselines.
-        num_felt: see `Samples`.
-    """
+    """Moments of both parts over all units: samples, or pairs where starts are random."""
 
     first: Moments
     unbiased: Moments
-    difference: Moments
+    difference: Moments  # unbiased terms minus derivatives
     costs: Moments
-    scaled: Moments
+    scaled: Moments  # derivatives by the noise, in its standard deviations
     secants: SecantSums
-    linear_variance: Scalar
-    beta: Scalar
-    num_costs: Scalar
-    num_groups: Scalar
-    num_felt: Int[Array, ""]
+    linear_variance: Scalar  # variance of the costs that the mean derivative explains, summed over samples
+    beta: Scalar  # sum of the shares of the linear part that were taken off
+    num_costs: Scalar  # number of samples in the last two sums
+    num_groups: Scalar  # number of groups of samples that share their baselines
+    num_felt: Int[Array, ""]  # see `Samples`
 
     def evidence(self) -> Evidence:
         """Return the evidence for a rule, with all coordinates as one block."""

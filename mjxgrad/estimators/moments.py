@@ -71,16 +71,11 @@ class ScoreMoments(eqx.Module):
     unit. Moving the centre acts on them linearly: $u \to u + \bar s\,\Delta$, $p \to p + \bar s\,\Delta$. Sums of features
     and of their products about any centre therefore follow from sums about another. About the mean they merge without
     cancellation; about zero or the noise-free cost they give the other baselines.
-
-    Attributes:
-        costs: moments of $\bar f$; its mean is the centre.
-        first: sums of (u, p, s̄).
-        second: sums of their products.
     """
 
-    costs: Moments
-    first: Float[Array, "3 dim"]
-    second: Float[Array, "3 3 dim"]
+    costs: Moments  # moments of f̄, whose mean is the centre
+    first: Float[Array, "3 dim"]  # sums of (u, p, s̄)
+    second: Float[Array, "3 3 dim"]  # sums of their products
 
     @classmethod
     def of(

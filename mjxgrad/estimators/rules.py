@@ -16,6 +16,7 @@ from scipy import stats
 from mjxgrad._arrays import is_known
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.estimators.moments import Moments
+from mjxgrad.objective.base import Scalar
 
 
 class Evidence(eqx.Module):
@@ -102,14 +103,6 @@ class FixedAlpha(eqx.Module):
         return Weights(alpha, Reason.fixed, jnp.where(alpha > 0, jnp.nan, 0))
 
 
-class InverseVariance(eqx.Module):
-    r"""$\alpha = V^0/(V^0 + V^1)$: least variance if both parts are independent, blind to bias."""
-
-    def __call__(self, evidence: Evidence) -> Weights:
-        alpha = evidence.least_variance()
-        return Weights(alpha, Reason.inverse_variance, jnp.where(alpha > 0, jnp.nan, 0))
-
-
 class BiasConstrained(eqx.Module):
     r"""Least variance as far as a bound on the bias allows.
 
@@ -123,8 +116,7 @@ class BiasConstrained(eqx.Module):
         failure_probability: $\delta$, below 1.
 
     References:
-        Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022,
-        arXiv:2202.00817, section 4.
+        Suh, Simchowitz, Zhang, Tedrake. ICML 2022, arXiv:2202.00817, section 4; see `first_order`.
     """
 
     gamma: ArrayLike
@@ -149,29 +141,6 @@ class BiasConstrained(eqx.Module):
         """Return ε; the error of the unbiased part exceeds it with probability δ at most."""
         rate = jnp.log((evidence.dim + 1) / self.failure_probability) / evidence.real_count
         return jnp.sqrt(2 * evidence.zeroth_variance * rate) + 2 / 3 * jnp.asarray(self.bound) * rate
-
-
-class Concavity(eqx.Module):
-    r"""Inverse variance if $V^1 \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$.
-
-    A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. A cost with jumps has
-    too much variance for its derivatives.
-
-    Attributes:
-        slack: $c$.
-
-    References:
-        Onoda et al., arXiv:2604.18161 (DDCG), here with the noise of each coordinate in its own standard deviations.
-    """
-
-    slack: float = 0.3
-
-    def __call__(self, evidence: Evidence) -> Weights:
-        needed = 2 * (1 - self.slack) * evidence.cost_variance - 2 * evidence.scaled_first_norm**2
-        is_smooth = evidence.scaled_first_variance >= needed
-        alpha = jnp.where(is_smooth, evidence.least_variance(), 0)
-        reason = Reason.where(is_smooth, Reason.inverse_variance, Reason.inconsistent)
-        return Weights(alpha, reason, jnp.where(alpha > 0, jnp.nan, 0))
 
 
 class Consistent(eqx.Module):
@@ -216,9 +185,7 @@ _MOST_FAILURES = 0.2
 _LONGEST_TABLE = 1000
 
 
-def confidence_radius(
-    variance: Float[Array, ""], count: Int[Array, ""], failure_probability: float
-) -> Float[Array, ""]:
+def confidence_radius(variance: Scalar, count: Int[Array, ""], failure_probability: float) -> Scalar:
     """Return a radius that the norm of a mean's error exceeds with at most the given probability.
 
     It is Student's quantile times the standard error of the whole vector. For a nearly normal mean it is safe for every

@@ -31,29 +31,17 @@ GROUP_SIZE = 64
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The rollouts that an estimator asks for; a unit is one sample or one pair, independent of all other units.
+    """The rollouts that an estimator asks for; a unit is one sample or one pair, independent of all other units."""
 
-    Attributes:
-        num_samples: number of rollouts with noise.
-        chunk_size: rollouts at a time, or None for the default.
-        antithetic: whether every noise is used with its mirror image.
-        with_gradient: whether the cost is differentiated by the parameters.
-        with_score: whether the score by the parameters is wanted.
-        by_noise: whether derivative and score are by the noise instead.
-        with_zero_noise: whether there is one more rollout without noise.
-        shares_start: whether samples come in pairs that share a random start and differ only in their noise.
-        zero_noise_per_unit: whether each unit has one more rollout, without noise, from its own random start.
-    """
-
-    num_samples: int
-    chunk_size: int | None = None
-    antithetic: bool = False
-    with_gradient: bool = False
-    with_score: bool = False
-    by_noise: bool = False
-    with_zero_noise: bool = False
-    shares_start: bool = False
-    zero_noise_per_unit: bool = False
+    num_samples: int  # rollouts with noise
+    chunk_size: int | None = None  # rollouts at a time; None is the default
+    antithetic: bool = False  # every noise is used with its mirror image
+    with_gradient: bool = False  # the cost is differentiated by the parameters
+    with_score: bool = False  # the score by the parameters is wanted
+    by_noise: bool = False  # derivative and score are by the noise instead
+    with_zero_noise: bool = False  # there is one more rollout without noise
+    shares_start: bool = False  # samples come in pairs that share a random start and differ only in their noise
+    zero_noise_per_unit: bool = False  # each unit has one more rollout, without noise, from its own random start
 
     def __post_init__(self):
         pairs = " with antithetic pairs" if self.antithetic else " where pairs share a random start"
@@ -108,21 +96,13 @@ def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None
 
 
 class Samples(eqx.Module):
-    """Rollouts, by unit and by rollout within the unit.
+    """Rollouts, by unit and by rollout within the unit."""
 
-    Attributes:
-        rollouts: the rollouts, differentiated by the noise or by the parameters; zero where it is not asked for.
-        is_noisy: False for units that pad the last chunk and for the unit without noise.
-        is_noise_free: True for the unit without noise.
-        zero_noise_costs: cost of each unit's own rollout without noise; zero if there is none.
-        has_no_effect: whether noise that is not zero changed no cost within the unit and all derivatives are zero.
-    """
-
-    rollouts: Differentiated
-    is_noisy: Bool[Array, " units"]
-    is_noise_free: Bool[Array, " units"]
-    zero_noise_costs: Float[Array, " units"]
-    has_no_effect: Bool[Array, " units"]
+    rollouts: Differentiated  # derivatives by the noise or by the parameters; zero where not asked for
+    is_noisy: Bool[Array, " units"]  # False for units that pad the last chunk and for the unit without noise
+    is_noise_free: Bool[Array, " units"]  # True for the unit without noise
+    zero_noise_costs: Float[Array, " units"]  # cost of each unit's own rollout without noise; zero if there is none
+    has_no_effect: Bool[Array, " units"]  # noise that is not zero changed no cost within the unit; derivatives are zero
 
     def zeroth_order_mask(self) -> Bool[Array, " units"]:
         """Return which units a zeroth-order estimate can use, whatever their gradients."""
@@ -203,22 +183,17 @@ class Group(eqx.Module):
     """Samples differentiated by noise that are compared with each other.
 
     Values that are not finite, or pad a chunk, are zero and masked by `has_cost` (and `has_derivative`).
-
-    Attributes:
-        costs: costs minus their mean, the `centre`.
-        rounding: largest magnitude of a cost, the scale of its rounding.
-        per_unit: 2 where samples 2i and 2i + 1 share a start, else 1.
     """
 
-    costs: Float[Array, "*groups samples"]
+    costs: Float[Array, "*groups samples"]  # costs minus their mean, the `centre`
     derivatives: Float[Array, "*groups samples m"]
     scores: Float[Array, "*groups samples m"]
     has_cost: Bool[Array, "*groups samples"]
     has_derivative: Bool[Array, "*groups samples"]
     stddev: Float[Array, "*groups m"]
     centre: Float[Array, "*groups"]
-    rounding: Float[Array, "*groups"]
-    per_unit: int = eqx.field(static=True)
+    rounding: Float[Array, "*groups"]  # largest magnitude of a cost, the scale of its rounding
+    per_unit: int = eqx.field(static=True)  # 2 where samples 2i and 2i + 1 share a start, else 1
 
     @classmethod
     def of(cls, samples: Samples) -> "Group":

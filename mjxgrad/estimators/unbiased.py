@@ -23,17 +23,11 @@ _ROUNDING = 32.0
 
 
 class UnbiasedTerms(eqx.Module):
-    r"""The terms of a group, whose mean after the pull-back is the estimate.
+    """The terms of a group, whose mean after the pull-back is the estimate."""
 
-    Attributes:
-        by_noise: term of each sample before the pull-back.
-        beta: share $\beta$ of each sample.
-        linear_variance: variance of the linear part $a\cdot w$ over the samples.
-    """
-
-    by_noise: Float[Array, "samples m"]
-    beta: Float[Array, " samples"]
-    linear_variance: Float[Array, ""]
+    by_noise: Float[Array, "samples m"]  # term of each sample before the pull-back
+    beta: Float[Array, " samples"]  # share β of each sample
+    linear_variance: Float[Array, ""]  # variance of the linear part a·w over the samples
 
 
 def gram(samples: Group) -> _Pairs:
@@ -132,22 +126,12 @@ class SecantSums(eqx.Module):
     The residual also bounds the bias. Let $J$ be the part of the cost that derivatives miss. The bias of the first-order
     estimate is $-\mathbb{E}[J s]$. The components of $\sigma s$ are orthonormal, so its norm is at most
     $\mathrm{sd}(J)/\sigma$ in any dimension (Bessel's inequality), and $\mathbb{E}[r^2] \approx 2\,\mathrm{Var}\,J$.
-
-    Attributes:
-        residual: squared residuals over squared distances, in standard deviations of the noise.
-        difference: squared differences of costs over the same squared distances.
-        missed: half the squared residuals.
-        pairs: number of pairs.
-
-    References:
-        Compare Onoda et al., arXiv:2604.18161 (DDCG). They test the Poincaré inequality between the variances of costs and
-        derivatives, a necessary condition for smoothness; this test looks at each pair.
     """
 
-    residual: Float[Array, ""]
-    difference: Float[Array, ""]
-    missed: Float[Array, ""]
-    pairs: Float[Array, ""]
+    residual: Float[Array, ""]  # squared residuals over squared distances, in standard deviations of the noise
+    difference: Float[Array, ""]  # squared differences of costs over the same squared distances
+    missed: Float[Array, ""]  # half the squared residuals
+    pairs: Float[Array, ""]  # number of pairs
 
     def inconsistency(self) -> Float[Array, ""]:
         """Return the share of the squared secants that derivatives do not explain; zero where they explain all."""

@@ -1,6 +1,5 @@
 """Parameters of a scene from recorded motions, through contact."""
 
-from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import (
     Parameter,
     armature,
@@ -9,6 +8,7 @@ from mjxgrad.identification.parameters import (
     friction_loss,
     gains,
     gear,
+    inertia,
     mass,
     softness,
 )

@@ -16,7 +16,6 @@ import numpy as np
 
 from mjxgrad._text import write
 from mjxgrad.identification import parameters
-from mjxgrad.identification.inertia import inertia
 from mjxgrad.identification.parameters import Parameter
 from mjxgrad.identification.recording import Recording, start_of
 from mjxgrad.scene import Scene
@@ -37,10 +36,8 @@ _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale o
 def parameter(scene: Scene, text: str) -> Parameter:
     """Return a parameter from text such as `mass:torso`, `friction`, `damping:hip,knee=0.1..5` or `delay=0..0.05`.
 
-    Args:
-        scene: the scene with the nominal values.
-        text: one of `KINDS`, then names that share one value, then bounds. Friction and softness take geoms, or a pair as
-            `floor/foot`, or nothing for all contacts.
+    The text is one of `KINDS`, then names that share one value, then bounds. Friction and softness take geoms, or a pair as
+    `floor/foot`, or nothing for all contacts. The scene has the nominal values.
 
     Raises:
         ValueError: if the text has another form, or a name is unknown.
@@ -71,22 +68,19 @@ def parameter(scene: Scene, text: str) -> Parameter:
         return getattr(parameters, kind)(scene, *names, bounds=bounds)
     if len(names) > 1 or (bounds is not None and kind == "inertia"):
         raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
-    return inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
+    return parameters.inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
 
 
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
-    """Return a recorded motion, and the names of the columns that do not belong to the scene.
+    """Return a motion recorded as CSV with a line of names, or as NPZ, and the names of columns that the scene does not have.
 
     Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
     `act:actuator`, readings `sensor:name`. The kind may be left out for a unique name: a joint is then its position, an
     actuator its control. An element with several numbers takes an index, `qpos:root[0]`, or `qpos[7]` in the whole array. An
-    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers.
+    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers. Empty cells and
+    NaN were not measured.
 
     Each signal is weighed by its variation. The motion begins at its first row; missing parts are the scene's pose, at rest.
-
-    Args:
-        scene: the recorded scene.
-        path: CSV with a line of names, or NPZ. Empty cells and NaN were not measured.
 
     Raises:
         ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator.

@@ -10,19 +10,24 @@ import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import scipy.spatial
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness
-from mjxgrad.contact.parameters import ContactPair, contact_parameters, deciding_geoms
+from mjxgrad.contact.parameters import Pairs, contact_parameters, deciding_geoms
 from mjxgrad.scene import Scene
 from mjxgrad.stepping.rows import index_of
 
 Write = Callable[[mjx.Model, Array], dict[str, Array]]
 """Function from a model and the parameter's value to the changed fields of the model."""
+Bounds = tuple[float, float] | None
 _Object = mujoco.mjtObj
 _FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
 _AT_BOUND = 1e-6  # share of the range
+# The bounds of `mujoco.sysid` for inertia: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre by 0.5 m.
+_REACH = np.array([np.log(10) / 2, *[np.log(2) / 2] * 3, *[0.5] * 3, *[0.5] * 3])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,13 +129,10 @@ def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping
     return scene.with_model(**changed) if changed else scene
 
 
-def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def mass(scene: Scene, *bodies: str, bounds: Bounds = None) -> Parameter:
     """Return the mass of a body, or the common mass of several (kg); inertias scale with it, as with the density.
 
-    Args:
-        scene: the scene with the nominal value.
-        *bodies: names of the bodies.
-        bounds: least and greatest value; a tenth and ten times the nominal value by default.
+    The bounds are a tenth and ten times the scene's value by default.
 
     Raises:
         ValueError: if there is no such body.
@@ -149,10 +151,7 @@ def mass(scene: Scene, *bodies: str, bounds: tuple[float, float] | None = None) 
 def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset: Any) -> Parameter:
     """Return the common sliding friction of the selected contacts; all geoms that determine it receive the value.
 
-    Args:
-        scene: the scene with the nominal value.
-        bounds: least and greatest coefficient.
-        **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
+    The contacts are selected by `pairs` or `geoms`, as in `Softness`; all by default.
 
     Raises:
         ValueError: if a name is unknown or can touch nothing.
@@ -174,14 +173,10 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
     return _positive(float(present[0, 0]), bounds, write, "", "friction")
 
 
-def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = None, **subset: Any) -> Parameter:
-    """Return one part of the contact softness.
+def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -> Parameter:
+    """Return one part of the softness of the selected contacts; contacts as in `friction`, bounds as in `mass`.
 
-    Args:
-        scene: the scene with the nominal value.
-        part: "stiffness" (1/s²), "damping_ratio", which determines the restitution, or "width" (m).
-        bounds: least and greatest value; a tenth and ten times the nominal value by default.
-        **subset: `pairs` or `geoms`, as in `Softness`; all contacts by default.
+    The parts are "stiffness" (1/s²), "damping_ratio", which determines the restitution, and "width" (m).
 
     Raises:
         ValueError: if there is no such part, or as `Softness`.
@@ -199,28 +194,28 @@ def softness(scene: Scene, part: str, *, bounds: tuple[float, float] | None = No
     return _positive(float(getattr(present, part)[0]), bounds, write, units[part], part)
 
 
-def _touching(scene: Scene, named: Softness) -> tuple[ContactPair, ...]:
+def _touching(scene: Scene, named: Softness) -> Pairs:
     if found := named.selected(scene.model):
         return found
     raise ValueError(f"friction and softness need geoms that can touch, got none in {scene.name}")
 
 
-def damping(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def damping(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the damping of a joint, or the common damping of several (N s/m or N m s/rad); otherwise as `mass`."""
     return _of_joints(scene, "dof_damping", joints, bounds)
 
 
-def armature(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def armature(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the armature of a joint, or the common armature of several (kg or kg m²); otherwise as `mass`."""
     return _of_joints(scene, "dof_armature", joints, bounds)
 
 
-def friction_loss(scene: Scene, *joints: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def friction_loss(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the dry friction of a joint, or the common friction of several (N or N m); otherwise as `mass`."""
     return _of_joints(scene, "dof_frictionloss", joints, bounds)
 
 
-def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = None) -> Parameter:
+def gear(scene: Scene, *actuators: str, bounds: Bounds = None) -> Parameter:
     """Return the first gear number of an actuator, or the common one of several; otherwise as `mass`."""
 
     def place(model: mjx.Model) -> tuple:
@@ -230,12 +225,7 @@ def gear(scene: Scene, *actuators: str, bounds: tuple[float, float] | None = Non
 
 
 def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
-    """Return the two gains of a position actuator, `kp` and `kv`.
-
-    Args:
-        scene: the scene with the nominal values.
-        actuator: name of the actuator.
-        bounds: least and greatest value, each a number or one per gain; a tenth and ten times the nominal values by default.
+    """Return the two gains of a position actuator, `kp` and `kv`; bounds as in `mass`, each a number or one per gain.
 
     Raises:
         ValueError: if there is no such actuator, or a gain is zero and no bounds are given.
@@ -250,7 +240,7 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
     return _positive(-np.asarray(scene.model.actuator_biasprm)[index, 1:3], bounds, write, "", "gains")
 
 
-def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[float, float] | None) -> Parameter:
+def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: Bounds) -> Parameter:
     def place(model: mjx.Model) -> tuple:
         index = [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]
         return (np.flatnonzero(np.isin(model.dof_jntid, index)),)
@@ -258,9 +248,7 @@ def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: tuple[
     return _common(scene, field, place, bounds, field.removeprefix("dof_"))
 
 
-def _common(
-    scene: Scene, field: str, place: Callable[[mjx.Model], tuple], bounds: tuple[float, float] | None, name: str
-) -> Parameter:
+def _common(scene: Scene, field: str, place: Callable[[mjx.Model], tuple], bounds: Bounds, name: str) -> Parameter:
     """Return the common number at some places of a model's array."""
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
@@ -278,3 +266,77 @@ def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: 
     if name != "gear" and np.any(np.asarray(bounds[0]) < 0):
         raise ValueError(f"bounds of {name} must not be negative, got {bounds[0]}")
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)
+
+
+def inertia(scene: Scene, body: str) -> Parameter:
+    r"""Return mass, centre of mass and inertia tensor of a named body as ten unconstrained numbers.
+
+    The mass $m$, first moment $h$ and second moments $\Sigma = \int x x^T \mathrm{d}m$ form the pseudo-inertia. It is positive
+    definite for every physically possible body,
+
+    $$J = \begin{pmatrix} \Sigma & h \\ h^T & m \end{pmatrix} = U U^T, \qquad U = e^{\alpha} \begin{pmatrix} e^{d_1} & s_{12} &
+    s_{13} & t_1 \\ & e^{d_2} & s_{23} & t_2 \\ & & e^{d_3} & t_3 \\ & & & 1 \end{pmatrix}.$$
+
+    The ten numbers are $(\alpha, d_1, d_2, d_3, s_{12}, s_{23}, s_{13}, t_1, t_2, t_3)$, as in `mujoco.sysid`. The mass is
+    $e^{2 \alpha}$, and $t$ the centre of mass.
+
+    Raises:
+        ValueError: if there is no such body, or a flat body makes a logarithm infinite.
+
+    References:
+        Rucker, Wensing. Smooth parameterization of rigid-body inertia. IEEE Robotics and Automation Letters 7(2), 2022.
+    """
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        index, parts = index_of(model, _Object.mjOBJ_BODY, body), body_fields(pseudo_inertia(value))
+        return {name: getattr(model, name).at[index].set(part) for name, part in parts.items()}
+
+    index = index_of(scene.model, _Object.mjOBJ_BODY, body)
+    names = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+    fields = [np.asarray(getattr(scene.model, name), float)[index] for name in names]
+    nominal = logarithms(second_moments(*fields))
+    if not np.isfinite(nominal).all():
+        raise ValueError(f"inertia needs a body with mass and extent in all directions, got {body!r}")
+    return Parameter(nominal, nominal - _REACH, nominal + _REACH, write=write)
+
+
+def pseudo_inertia(numbers: Float[Array, "10"]) -> Float[Array, "4 4"]:
+    """Return the pseudo-inertia of ten numbers (kg, kg m, kg m²)."""
+    alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = numbers
+    rows = [[jnp.exp(d1), s12, s13, t1], [0, jnp.exp(d2), s23, t2], [0, 0, jnp.exp(d3), t3], [0, 0, 0, 1]]
+    root = jnp.exp(alpha) * jnp.array(rows)
+    return root @ root.T
+
+
+def logarithms(pseudo: np.ndarray) -> np.ndarray:
+    """Return the ten numbers of a pseudo-inertia; NaN where it is not positive definite."""
+    try:
+        root = np.linalg.cholesky(pseudo[::-1, ::-1])[::-1, ::-1]
+    except np.linalg.LinAlgError:
+        return np.full(10, np.nan)
+    unit = root / root[3, 3]
+    shears = (unit[0, 1], unit[1, 2], unit[0, 2])
+    return np.array([np.log(root[3, 3]), *np.log(np.diag(unit)[:3]), *shears, *unit[:3, 3]])
+
+
+def second_moments(mass: float | np.ndarray, centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inertia from MuJoCo's fields of a body: mass, ipos, inertia and iquat."""
+    rotation = scipy.spatial.transform.Rotation.from_quat(axes, scalar_first=True).as_matrix()
+    about_centre = rotation @ np.diag(moments.sum() / 2 - moments) @ rotation.T
+    offset = np.append(centre, 1.0)
+    return mass * np.outer(offset, offset) + np.pad(about_centre, (0, 1))
+
+
+def body_fields(pseudo: Float[Array, "4 4"]) -> dict[str, Float[Array, "..."]]:
+    """Return MuJoCo's fields of the body with this pseudo-inertia.
+
+    For equal principal moments the axes have no derivative, though the tensor has one. The moments are therefore separated by
+    a share of √ε, too little to affect the motion.
+    """
+    mass, centre = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+    spread = pseudo[:3, :3] - mass * jnp.outer(centre, centre)
+    separation = jnp.sqrt(jnp.finfo(spread.dtype).eps) * jnp.trace(spread)
+    along, axes = jnp.linalg.eigh(spread + separation * jnp.diag(jnp.arange(3.0)))
+    axes = axes * jnp.sign(jnp.linalg.det(axes))
+    moments, turn = jnp.sum(along) - along, Rotation.from_matrix(axes).as_quat(scalar_first=True)
+    return {"body_mass": mass, "body_ipos": centre, "body_inertia": moments, "body_iquat": turn}

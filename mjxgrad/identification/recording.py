@@ -67,14 +67,10 @@ class Recording:
                 raise ValueError(f"noise of {name} of {self.name} must be positive, or inf for no weight, got {value}")
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
-        """Return windows of a duration, each from a measured state; a shorter remainder is dropped.
+        """Return windows of a duration (s) at the scene's time step (s), each from a measured state; the rest is dropped.
 
         Short windows keep a motion that is hard to predict close to the measurements. Their starts are as noisy as the
         measurements: `free_start=True` of `identify` estimates them, too.
-
-        Args:
-            duration: length of a window (s).
-            timestep: time step of the scene (s).
 
         Raises:
             ValueError: if positions or velocities were not measured, or no window fits.

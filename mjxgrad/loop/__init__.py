@@ -3,5 +3,3 @@
 from mjxgrad.loop.optimise import estimated_gradient, optimise
 from mjxgrad.loop.result import History, Optimisation, Stopped
 from mjxgrad.loop.run import Method, run, side_by_side
-
-__all__ = ["History", "Method", "Optimisation", "Stopped", "estimated_gradient", "optimise", "run", "side_by_side"]

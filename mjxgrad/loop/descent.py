@@ -57,21 +57,14 @@ class RunOptions(eqx.Module):
 
 
 class Carry(eqx.Module):
-    """The state of one run between two steps; see also `Optimisation`.
-
-    Attributes:
-        state: the method's own state.
-        key: key of the run; the noise of a step comes from it and the number of the step.
-        num_in_a_row: length of the present row of steps not taken.
-        num_still: length of the present row of steps that felt nothing.
-    """
+    """The state of one run between two steps; see also `Optimisation`."""
 
     params: Vector
-    state: PyTree
-    key: PRNGKeyArray
+    state: PyTree  # the method's own state
+    key: PRNGKeyArray  # key of the run; the noise of a step comes from it and the number of the step
     best: Best
-    num_in_a_row: Int[Array, ""]
-    num_still: Int[Array, ""]
+    num_in_a_row: Int[Array, ""]  # length of the present row of steps not taken
+    num_still: Int[Array, ""]  # length of the present row of steps that felt nothing
     stopped: Stopped
 
 

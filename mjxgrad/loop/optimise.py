@@ -16,8 +16,7 @@ from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
 from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective, flattened, of_vector
-from mjxgrad.objective.base import Scalar, Vector, as_objective
-from mjxgrad.objective.parameters import Restored
+from mjxgrad.objective.base import Restored, Scalar, Vector, as_objective
 
 AnnealedObjective = Callable[[Scalar], Objective]
 Annealing = Callable[[ArrayLike], ArrayLike]
@@ -64,9 +63,6 @@ def optimise(
         num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
         **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`; see `RunOptions`.
-
-    Returns:
-        The last and the best parameters, the history, the reason for stopping and the rollouts spent.
 
     Raises:
         ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,

@@ -4,8 +4,12 @@ A method is two functions, from a start to a carry and from a carry to the next;
 """
 
 import functools
+import hashlib
+import io
+import json
 import math
 import time
+import zipfile
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,26 +23,26 @@ from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from mjxgrad._programs import compile_once
+from mjxgrad._text import write
 from mjxgrad.batched.device import all_devices
-from mjxgrad.loop import checkpoint as checkpoints
 
 Log = Callable[[int, dict[str, float]], Any]
+_FORMAT = 3  # of checkpoints
+_PARTS = {
+    "program": "the code of environment, objective, estimator, optimiser, method or versions of the libraries",
+    "arrays": "arrays in environment, objective or method",
+    "start": "params or key",
+}
 
 
 class Progress(NamedTuple):
-    """The state and the records of a run so far.
+    """The state and the records of a run so far."""
 
-    Attributes:
-        carry: carry after the last step.
-        found: records of the steps, in NumPy, with the steps on the first axis.
-        seconds: wall-clock time of each step, without compilation, measured per segment and divided among its steps.
-        compile_seconds: time of tracing and compilation in this session.
-    """
-
-    carry: PyTree
-    found: PyTree
+    carry: PyTree  # after the last step
+    found: PyTree  # records of the steps, in NumPy, with the steps on the first axis
+    # Wall-clock time of each step, without compilation, measured per segment and divided among its steps.
     seconds: Float[np.ndarray, " steps"]
-    compile_seconds: float = 0.0
+    compile_seconds: float = 0.0  # time of tracing and compilation in this session
 
     @property
     def num_steps(self) -> int:
@@ -93,7 +97,7 @@ def side_by_side(methods: Sequence[Any]) -> tuple[Any, list[int | None]]:
     if not all(eqx.tree_equal(parts[0][1], other) for _, other in parts):
         raise ValueError("methods side by side must differ in numbers alone; run each separately")
     numbers = list(zip(*(jax.tree.leaves(arrays) for arrays, _ in parts), strict=True))
-    is_common = [len(set(map(checkpoints.digest, each))) == 1 for each in numbers]
+    is_common = [len(set(map(_digest, each))) == 1 for each in numbers]
     joined = [each[0] if same else jnp.stack(each) for each, same in zip(numbers, is_common, strict=True)]
     arrays = jax.tree.unflatten(jax.tree.structure(parts[0][0]), joined)
     return eqx.combine(arrays, parts[0][1]), [None if same else 0 for same in is_common]
@@ -157,9 +161,9 @@ def run(
         # Classes of one name may differ in code. The lowered program has every number that is no argument, such as a rate.
         text = np.frombuffer(traced.lower().as_text().encode(), np.uint8)
         parts = {"start": start, "arrays": eqx.filter(method.shared(), eqx.is_array), "program": text}
-        identity = method.identity() | {name: checkpoints.digest(part) for name, part in parts.items()}
+        identity = method.identity() | {name: _digest(part) for name, part in parts.items()}
     if checkpoint is not None and checkpoint.exists():
-        carry, found, seconds = checkpoints.load(checkpoint, progress[:3], identity)
+        carry, found, seconds = _load(checkpoint, progress[:3], identity)
         progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
     on_disk, compiled, is_first = progress.num_steps, None, jax.process_index() == 0
     try:
@@ -171,14 +175,14 @@ def run(
                 progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
             progress = _after(progress, functools.partial(compiled, *given))
             if checkpoint is not None and is_first:
-                checkpoints.save(checkpoint, progress[:3], identity)
+                _save(checkpoint, progress[:3], identity)
                 on_disk = progress.num_steps
             if log is not None and is_first:
                 log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
     finally:
         # Also after an interruption of a save: KeyboardInterrupt goes on to the caller.
         if checkpoint is not None and is_first and progress.num_steps > on_disk:
-            checkpoints.save(checkpoint, progress[:3], identity)
+            _save(checkpoint, progress[:3], identity)
     return method.result(progress)
 
 
@@ -239,3 +243,61 @@ def _placed(tree: PyTree, sharding: jax.sharding.Sharding | None) -> PyTree:
         return jax.device_put(np.asarray(x), sharding)
 
     return tree if sharding is None else jax.tree.map(put, tree)
+
+
+def _save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
+    """Write a pytree of arrays atomically: an interruption leaves the former file intact."""
+    leaves = {f"leaf{i}": _as_numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
+    header = json.dumps({"format": _FORMAT, **fingerprint}).encode()
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, header=np.frombuffer(header, np.uint8), **leaves)
+    write(path, content.getvalue())
+
+
+def _load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
+    """Return the pytree that `_save` wrote, with the structure and types of `like`; refuse damaged files and other runs."""
+    try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is no archive of arrays")
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(archive["header"].tobytes())
+            leaves = [archive[f"leaf{i}"] for i in range(len(archive.files) - 1)]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"checkpoint must be a file that a run has saved, got {path}, which cannot be read ({error}); "
+            "delete it to begin anew"
+        ) from error
+    expected = {"format": _FORMAT, **fingerprint}
+    differing = {name: value for name, value in expected.items() if header.get(name) != value}
+    if differing:
+        changes = [_PARTS.get(name, f"{name} was {header.get(name)} and is {here}") for name, here in differing.items()]
+        raise ValueError(
+            f"checkpoint must be of the same run, got {path} of one with other settings: {', '.join(changes)}; "
+            "use the settings of that run, or another path"
+        )
+    wanted = jax.tree.leaves(like)
+    return jax.tree.unflatten(jax.tree.structure(like), [_restored(x, y) for x, y in zip(leaves, wanted, strict=True)])
+
+
+def _digest(tree: PyTree) -> str:
+    """Return a short hash of the content of arrays."""
+    sha = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = _as_numpy(leaf)
+        sha.update(f"{array.dtype}{array.shape}".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()[:16]
+
+
+def _as_numpy(leaf: Any) -> np.ndarray:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    return np.asarray(leaf)
+
+
+def _restored(saved: np.ndarray, like: Any) -> Any:
+    if isinstance(like, jax.Array) and jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(like))
+    if saved.dtype.kind == "V":  # NumPy's format has no name for bfloat16 and its like
+        saved = saved.view(np.asarray(like).dtype)
+    return saved if isinstance(like, np.ndarray) else jnp.asarray(saved)

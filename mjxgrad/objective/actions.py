@@ -17,14 +17,15 @@ from mjxgrad.objective.base import (
     Differentiated,
     Objective,
     Scalar,
+    Stddev,
     Vector,
     as_scalar,
+    flattened,
     gaussian,
     positive,
     unchanged,
     value_and_gradient,
 )
-from mjxgrad.objective.parameters import flattened
 from mjxgrad.objective.task import Outcome, Policy, Task, as_pytree
 from mjxgrad.rollouts import State
 
@@ -102,7 +103,7 @@ class ActionNoise(Objective):
     def value(self, params: Vector, noise: PyTree) -> Scalar:
         return self.outcome(params, noise).cost
 
-    def with_stddev(self, stddev: Float[Array, "..."] | float) -> "ActionNoise":
+    def with_stddev(self, stddev: Stddev) -> "ActionNoise":
         return dataclasses.replace(self, stddev=_action_stddev(self.task, stddev))
 
     def _start_shape(self) -> PyTree:
@@ -188,18 +189,12 @@ class ClosedLoop(ActionNoise):
         return Partial(_ActionsTranspose(self.unravel), self.policy, params, states)
 
 
-def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
+def open_loop(task: Task, stddev: Stddev) -> OpenLoop:
     r"""Return the cost of a task as a function of its controls, with noise on each.
 
-    The parameters are the controls, flattened by `objective.ravel`; the score is $w/\sigma^2$. Where the task has a
-    distribution of starts, every rollout draws its own.
-
-    Args:
-        task: the controlled task with its cost.
-        stddev: $\sigma > 0$ in units of the controls; any shape that broadcasts to (horizon, nu).
-
-    Returns:
-        The objective, with `dim` = horizon * nu.
+    The parameters are the horizon * nu controls, flattened by `objective.ravel`; the score is $w/\sigma^2$. Where the task has
+    a distribution of starts, every rollout draws its own. The standard deviation $\sigma > 0$ is in units of the controls, of
+    any shape that broadcasts to (horizon, nu).
 
     Raises:
         ValueError: if `stddev` is not positive or does not broadcast, or if the task has no controls.
@@ -208,9 +203,7 @@ def open_loop(task: Task, stddev: float | Float[Array, "..."]) -> OpenLoop:
     return OpenLoop(task=task, stddev=stddev, dim=task.horizon * task.num_controls)
 
 
-def closed_loop(
-    task: Task, policy: Policy, stddev: float | Float[Array, "..."], *, params: PyTree = None
-) -> ClosedLoop:
+def closed_loop(task: Task, policy: Policy, stddev: Stddev, *, params: PyTree = None) -> ClosedLoop:
     r"""Return the cost of a task as a function of a policy's parameters, with noise on its actions.
 
     The action is $u_t = \pi_\theta(x_t) + w_t$. The score of a rollout is
@@ -262,7 +255,7 @@ class _ActionsTranspose:
         return transpose(by_actions)[0]
 
 
-def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:
+def _action_stddev(task: Task, stddev: Stddev) -> Float[Array, "..."]:
     shape = (task.horizon, task.num_controls)
     if task.horizon * task.num_controls == 0:
         raise ValueError(
@@ -309,22 +302,14 @@ def linear_policy(
     bias: bool = True,
     observe: Callable[[Any], Float[Array, " observed"]] = whole_state,
 ) -> tuple[LinearPolicy, eqx.nn.Linear]:
-    """Return the policy u = K x + k, with parameters that are zero: K is their `weight`, k their `bias`.
+    """Return the policy u = K x + k and its parameters, which are zero: K is their `weight`, k their `bias`.
 
         policy, params = linear_policy(4, 1)
         objective = closed_loop(task, policy, stddev=0.1, params=params)
 
-    Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero.
-
-    Args:
-        num_states: number of observed values.
-        num_controls: number of controls.
-        bias: whether there is the constant k.
-        observe: function from the task's state or observations to a vector. Positions of a free body contain a
-            quaternion, and angles do not wrap, so choose what you need.
-
-    Returns:
-        The policy, called as `policy(params, state)`, and its parameters.
+    Actions are not bounded: beyond an actuator's `ctrlrange` MuJoCo clips them, and their derivative is zero. x is the whole
+    state, or the vector of `num_states` numbers that `observe` makes of the task's state or observations. Positions of a free
+    body contain a quaternion, and angles do not wrap, so choose what you need. Without `bias` there is no k.
 
     Raises:
         ValueError: if a number is below 1.

@@ -1,4 +1,4 @@
-r"""The interface of an objective to estimators: a draw of the noise, the value under it, and its score.
+r"""Objectives, the input of estimators: the interface, noise on parameters, and pytrees of parameters as a vector.
 
 Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. The score $s$ is the gradient of the log density of the noisy
 quantity by $\theta$; it satisfies $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
@@ -13,12 +13,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from mjxgrad.objective.task import as_pytree
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " dim"]
 """The parameters, or one number for each."""
+Stddev = float | Float[Array, "..."]
 
 # Up to this number forward mode is faster. On the rollout of tasks/ball_wall (one parameter, 512 samples, 2 cores) it took
 # 0.53 s and 7 s of compilation, reverse mode 1.7 s and 13 s. Each further parameter costs about one more forward pass.
@@ -114,7 +118,7 @@ class Objective(eqx.Module):
         (cost, score), gradient = value_and_gradient(lambda at: self.value_and_score(at, noise), params, has_aux=True)
         return Differentiated(cost, gradient, score, jnp.full_like(gradient, jnp.nan), Partial(unchanged))
 
-    def with_stddev(self, stddev: Float[Array, "..."] | float) -> "Objective":
+    def with_stddev(self, stddev: Stddev) -> "Objective":
         """Return the objective with another standard deviation of the same units and shape; traceable, for schedules.
 
         Raises:
@@ -203,10 +207,109 @@ def gaussian(key: PRNGKeyArray, stddev: Float[Array, "..."], shape: tuple[int, .
     return stddev * jax.random.normal(key, shape, stddev.dtype)
 
 
-def positive(stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:
+def positive(stddev: Stddev) -> Float[Array, "..."]:
     """Return the standard deviation as an array; raise a ValueError if it is known and not positive."""
     stddev = jnp.asarray(stddev, jnp.result_type(stddev, float))
     # A traced value (a noise schedule, a sweep) cannot be checked here.
     if not isinstance(stddev, jax.core.Tracer) and not bool((stddev > 0).all()):
         raise ValueError(f"stddev must be positive, got {stddev}")
     return stddev
+
+
+class ParameterNoise(Objective):
+    r"""$f(\theta + w)$ with $w \sim N(0, \mathrm{stddev}^2)$ on the parameters; see `parameter_noise`."""
+
+    function: Callable[[Any], Scalar]
+    stddev: Float[Array, " *dim"]
+    dim: int | None = eqx.field(static=True)
+
+    def sample_noise(self, key: PRNGKeyArray) -> Vector:
+        if self.dim is None:
+            raise ValueError("dim is not known: pass dim=... to parameter_noise")
+        return gaussian(key, self.stddev, (self.dim,))
+
+    def value(self, params: Vector, noise: Vector) -> Scalar:
+        return as_scalar(self.function(params + noise.astype(params.dtype)), "function")
+
+    def score(self, params: Vector, noise: Vector) -> Vector:
+        return (noise / self.stddev**2).astype(params.dtype)
+
+    def differentiate(self, params: Vector, noise: Vector) -> Differentiated:
+        cost, gradient = value_and_gradient(self.function, params + noise.astype(params.dtype))
+        stddev = jnp.broadcast_to(self.stddev, params.shape).astype(params.dtype)
+        return Differentiated(cost, gradient, self.score(params, noise), stddev, Partial(unchanged))
+
+    def with_stddev(self, stddev: Stddev) -> "ParameterNoise":
+        return parameter_noise(self.function, stddev, self.dim)
+
+
+def parameter_noise(
+    function: Callable[[Any], Scalar], stddev: float | Float[Array, "*dim"], dim: int | None = None
+) -> ParameterNoise:
+    r"""Smooth any function of parameters by Gaussian noise on them.
+
+    $F(\theta) = \mathbb{E}[f(\theta + w)]$, $w \sim N(0, \sigma^2 I)$, with score $w/\sigma^2$. The function, of a vector or of
+    the pytree of parameters, is traceable. $\sigma > 0$ is in the parameters' units, one number or one per parameter. Their
+    number `dim` is needed only to draw noise by hand: an estimator takes it from its parameters.
+
+    Raises:
+        ValueError: if `stddev` is not positive, or neither one number nor `dim` of them.
+    """
+    width = positive(stddev)
+    if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
+        raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
+    dim = width.shape[0] if width.ndim == 1 else dim
+    return ParameterNoise(function=as_pytree(function), stddev=width, dim=dim)
+
+
+class Restored(eqx.Module):
+    """A function of a pytree of parameters, as a function of their vector."""
+
+    function: Callable[[PyTree], Any]
+    restore: Callable[[Vector], PyTree] = eqx.field(static=True)
+
+    def __call__(self, vector: Vector) -> Any:
+        return self.function(self.restore(vector))
+
+
+def flattened(
+    params: PyTree, num_axes: int = 1
+) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
+    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; or a vector, None.
+
+    An array with more axes than a vector, or than one vector per seed, is a pytree, too: controls by step and actuator.
+    """
+    if eqx.is_array_like(params) and jnp.ndim(params) <= num_axes:
+        return jnp.asarray(params), None
+    # `is_inexact_array_like` calls a tracer's `__jax_array__`, which is None (jax 0.10.2, equinox 0.13.8).
+    is_parameter = lambda x: eqx.is_inexact_array(x) if eqx.is_array(x) else eqx.is_inexact_array_like(x)  # noqa: E731
+    arrays, others = eqx.partition(params, is_parameter)
+    vector, unravel = ravel_pytree(arrays)
+    if vector.size == 0:
+        raise ValueError(f"params must have floating-point arrays, got none in {params}; write 1.0 in place of 1")
+
+    def restore(vector: Float[Array, "..."]) -> PyTree:
+        return eqx.combine(jax.vmap(unravel)(vector) if vector.ndim == 2 else unravel(vector), others)
+
+    return vector, restore
+
+
+def of_vector(objective: Any, restore: Callable[[Vector], PyTree] | None) -> Any:
+    """Return an objective, or a function from a scale to one, that takes the vector of `flattened`.
+
+    An objective with noise on actions is unchanged: it takes a vector already, and restores its policy's parameters itself.
+    """
+    if restore is None or not (callable(objective) or isinstance(objective, ParameterNoise)):
+        return objective
+    if isinstance(objective, ParameterNoise):
+        return dataclasses.replace(objective, function=Restored(objective.function, restore))
+    return lambda scale: of_vector(objective(scale), restore)
+
+
+def as_vector(objective: Objective, params: PyTree) -> tuple[Objective, Vector, Callable[[Vector], PyTree]]:
+    """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form."""
+    vector, restore = flattened(params)
+    objective = of_vector(as_objective(objective), restore).sized_for(vector)
+    if restore is None:
+        return objective, vector, unchanged
+    return objective, vector, lambda gradient: eqx.filter(restore(gradient), eqx.is_inexact_array)

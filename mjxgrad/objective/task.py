@@ -49,16 +49,9 @@ class Task(eqx.Module):
         noise: Float[Array, "horizon nu"] | None = None,
         start: PyTree = None,
     ) -> Outcome:
-        """Roll out once.
+        """Roll out once, by default from the nominal start; return the cost, and the states in which the controls were chosen.
 
-        Args:
-            controls: the controls of each step, or a policy from parameters and a state to controls.
-            params: the policy's parameters.
-            noise: noise added to the controls.
-            start: state at the start; None is the nominal start.
-
-        Returns:
-            The cost, and the states in which the controls were chosen.
+        The controls are those of each step, or a policy from parameters and a state to controls. The noise is added to them.
         """
 
     def nominal_start(self) -> PyTree:

@@ -52,7 +52,6 @@ class Block:
     folded: str = ""  # title of the fold that holds table and code
 
     def __bool__(self) -> bool:
-        """Whether there is anything to show."""
         return any([self.text, self.drawings, self.video, self.faults, self.items, self.table, self.code])
 
 

@@ -3,19 +3,4 @@
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees
 from mjxgrad.rollouts.linearisation import Linearisation, linearise
 from mjxgrad.rollouts.rollout import rollout
-from mjxgrad.rollouts.state import State, initial_state
-from mjxgrad.rollouts.trajectory import DivergedError, Trajectory, check_trajectory
-
-__all__ = [
-    "DivergedError",
-    "Linearisation",
-    "Observe",
-    "Policy",
-    "Sees",
-    "State",
-    "Trajectory",
-    "check_trajectory",
-    "initial_state",
-    "linearise",
-    "rollout",
-]
+from mjxgrad.rollouts.state import DivergedError, State, Trajectory, check_trajectory, initial_state

@@ -34,14 +34,10 @@ class Linearisation(eqx.Module):
 def linearise(
     scene: Scene, state: State, ctrl: Float[ArrayLike, " nu"] | None = None, *, contact: Contact = Slope()
 ) -> Linearisation:
-    """Return the linear model of one step; use `jax.vmap` for a batch of states.
+    """Return the linear model of one step from a state; use `jax.vmap` for a batch of states.
 
-    Args:
-        scene: from `load_scene`.
-        state: the state before the step.
-        ctrl: the controls; None for the scene's resting ones.
-        contact: how contact is stepped, see `rollout`. The default is the model of the outcome; `mg.Discrete()` corresponds to
-            `mjd_transitionFD`.
+    The controls are the scene's resting ones by default. Contact is stepped as in `rollout`: the default is the model of the
+    outcome, and `mg.Discrete()` corresponds to `mjd_transitionFD`.
 
     Raises:
         ValueError: as `rollout`.

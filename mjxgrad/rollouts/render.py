@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, UInt8
 
 from mjxgrad._arrays import instance
 from mjxgrad._text import write
-from mjxgrad.rollouts.trajectory import Trajectory
+from mjxgrad.rollouts.state import Trajectory
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -40,7 +40,7 @@ def frames(
     width: int = 640,
     camera: str | int | mujoco.MjvCamera | None = None,
 ) -> Frames:
-    r"""Draw a trajectory at the frame times of a video.
+    r"""Return frames of a trajectory at the frame times of a video.
 
     Frame $i$ shows time $i \cdot$ `speed` / `fps`, by the nearest state: states are close in time, and the mean of
     two quaternions is not the orientation between them.
@@ -55,9 +55,6 @@ def frames(
         width: width in pixels.
         camera: name, number or free camera; None is MuJoCo's free camera at the scene's own default view, which goes along
             with a body that would leave it.
-
-    Returns:
-        The frames.
 
     Raises:
         ValueError: if `qpos` has no state, does not fit the model or is not finite, if a number is not positive, or
@@ -112,12 +109,8 @@ def _moves(
 def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     """Write frames as H.264 in MP4, with the ffmpeg of `imageio_ffmpeg`.
 
-    The file appears at its place once it is complete.
-
-    Args:
-        path: path of the file, in an existing folder.
-        video: the frames; an odd last row or column is left out, for H.264 takes even sizes only.
-        fps: frames per second.
+    The file appears at its place, in an existing folder, once it is complete. An odd last row or column is left out, for H.264
+    takes even sizes only.
 
     Raises:
         ValueError: if the video has no frames.

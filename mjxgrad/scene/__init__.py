@@ -1,16 +1,4 @@
 """Scenes that MJX can step, from MJCF: their contents, conversions and omissions."""
 
-from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.load import load_scene
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, sensor, site_position
-
-__all__ = [
-    "Conversion",
-    "Omission",
-    "Scene",
-    "SceneError",
-    "SceneWarning",
-    "load_scene",
-    "sensor",
-    "site_position",
-]

@@ -232,7 +232,6 @@ class _Rigid:
 
 
 def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mjx.Model, mjx.Data]:
-    """Return MJX's model and data."""
     if not contact_pairs(model):
         # MJX insists on a collision function even for pairs whose contact is disabled.
         model.geom_contype[:] = 0

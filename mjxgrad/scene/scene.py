@@ -20,7 +20,7 @@ from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
-from mjxgrad.contact.parameters import ContactPair, ContactParameters, contact_parameters
+from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
 from mjxgrad.contact.warnings import contact_differences, contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.refusals import has_medium
@@ -61,7 +61,7 @@ class Scene(eqx.Module):
     mj_model: mujoco.MjModel = eqx.field(static=True)
     omissions: tuple[Omission, ...] = eqx.field(static=True)
     conversions: tuple[Conversion, ...] = eqx.field(static=True)
-    pairs: tuple[ContactPair, ...] = eqx.field(static=True)
+    pairs: Pairs = eqx.field(static=True)
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
 
@@ -92,12 +92,10 @@ class Scene(eqx.Module):
     def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
         """Return the scene with other numbers of the MJX model, such as `geom_friction`, `timestep`, `gravity` or `wind`.
 
-        Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of scenes. Constants that
-        MuJoCo derives from masses, inertias, lengths and sizes are updated, unless they are given, too; see `mg.set_const`.
-
-        Args:
-            **fields: new values of the model's floating-point arrays, each of unchanged shape. Allowed options are the time
-                step (s), gravity (m/s²) and wind (m/s), which acts only in a medium.
+        The fields are the model's floating-point arrays, and of the options the time step (s), gravity (m/s²) and wind (m/s),
+        which acts only in a medium. Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of
+        scenes. Constants that MuJoCo derives from masses, inertias, lengths and sizes are updated, unless they are given, too;
+        see `mg.set_const`.
 
         Raises:
             ValueError: if there is no such field, it is not an array of numbers, or the shape differs. Known values are also
@@ -310,7 +308,7 @@ def _contacts(scene: Scene) -> str:
 
 
 def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield the columns of the table of pairs: name, unit, cells."""
+    """Yield name, unit and cells of each column."""
     parameters = scene.contact_parameters()
     yield "condim", "", [str(pair.condim) for pair in scene.pairs]
     yield "solref", "", [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()]

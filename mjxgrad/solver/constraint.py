@@ -84,33 +84,20 @@ class RowLayout:
 
 
 class Noise(eqx.Module):
-    """The effect of noise on the distance r on x of the rows of contacts; a cone uses its first row.
+    """The effect of noise on the distance r on x of the rows of contacts (m/s² or rad/s²); a cone uses its first row."""
 
-    Attributes:
-        spread: change of x when r changes by one length of the noise (m/s² or rad/s²); positive.
-        gate: x at which contact ends by distance and not by acceleration (m/s² or rad/s²).
-    """
-
-    spread: _PerRow
-    gate: _PerRow
+    spread: _PerRow  # change of x when r changes by one length of the noise; positive
+    gate: _PerRow  # x at which contact ends by distance and not by acceleration
 
 
 class Rows(eqx.Module):
-    """Parameters of the constraint rows of one state.
+    """Parameters of the constraint rows of one state."""
 
-    Attributes:
-        reference: the reference acceleration a_ref (m/s² or rad/s²).
-        weight: D, the inverse of the regularisation R (kg or kg m²).
-        bound: largest force of a friction loss row (N or N m); unused by other rows.
-        scales: (μ, f₁, ..., f_dim-1) of each contact, one array per elliptic group; μ = f₁/√impratio.
-        noise: noise on the rows, if the layout has noisy rows.
-    """
-
-    reference: _PerRow
-    weight: _PerRow
-    bound: _PerRow
-    scales: tuple[Float[Array, "_ _ *batch"], ...]
-    noise: Noise | None = None
+    reference: _PerRow  # the reference acceleration a_ref (m/s² or rad/s²)
+    weight: _PerRow  # D, the inverse of the regularisation R (kg or kg m²)
+    bound: _PerRow  # largest force of a friction loss row (N or N m); unused by other rows
+    scales: tuple[Float[Array, "_ _ *batch"], ...]  # (μ, f₁, f₂, ...) by contact and elliptic group; μ = f₁/√impratio
+    noise: Noise | None = None  # noise on the rows, if the layout has noisy rows
 
 
 def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
@@ -256,7 +243,6 @@ class _NoisyCone(eqx.Module):
 
 
 def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _NoisyCone:
-    """Return one group of elliptic contacts at x."""
     group, scale = layout.cones[which], rows.scales[which]
     u = _blocks(group, x) * scale
     square = sum_of_few(u[:, 1:] ** 2)[:, 0]
@@ -295,9 +281,7 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
     return Noise(rows.noise.spread[which], rows.noise.gate[which])
 
 
-def _mean_violation(
-    x: Float[Array, "n *batch"], noise: Noise
-) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
+def _mean_violation(x: _PerRow, noise: Noise) -> tuple[_PerRow, _PerRow]:
     """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.
 
     Above the gate the acceleration ends the force before the distance does, and the mean is the softened ramp. Below the

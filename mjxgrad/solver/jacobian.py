@@ -2,7 +2,7 @@ r"""The constraint Jacobian as a linear map, applied without being formed.
 
 A derivative of the solve needs only products of J and a vector, and their reverse mode is as cheap as the products. A
 contact's rows are the relative velocity of two bodies at a point: six numbers per body, whatever the number of joints. The
-solve needs the entries, see `sparse`. A map returns them group by group, and a pyramid's edges n ± μ t as its directions n, t.
+solve needs the entries, see `hessian`. A map returns them group by group, and a pyramid's edges n ± μ t as its directions n, t.
 They may have the batch as trailing axes, see `linear`; a map is applied to one state.
 """
 
@@ -27,21 +27,13 @@ _WASTE = 2.0
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Contacts or single rows (items) that act on the same joint velocities.
+    """Contacts or single rows (items) that act on the same joint velocities."""
 
-    Attributes:
-        dofs: indices of these joint velocities, ascending.
-        num: number of items.
-        dim: number of directions of each item.
-        is_pyramid: whether the rows are the edges n ± μ t of a pyramid, two for each direction but the first.
-        is_diagonal: whether each item acts on a single joint velocity, in the order of `dofs`.
-    """
-
-    dofs: tuple[int, ...]
-    num: int
-    dim: int = 1
-    is_pyramid: bool = False
-    is_diagonal: bool = False
+    dofs: tuple[int, ...]  # indices of these joint velocities, ascending
+    num: int  # number of items
+    dim: int = 1  # directions of each item
+    is_pyramid: bool = False  # whether the rows are a pyramid's edges n ± μ t, two for each direction but the first
+    is_diagonal: bool = False  # whether each item acts on a single joint velocity, in the order of `dofs`
 
     @property
     def rows_each(self) -> int:
@@ -169,18 +161,12 @@ class ContactRows(RowMap):
 
     An entry of J is (axis · wrench): the power of a unit force along a frame axis at a unit joint velocity. The wrench is about
     the centre of mass that the joint axes refer to. All contacts have the same number of sides; one at rest has no dofs.
-
-    Attributes:
-        lever: vector from that centre to the contact point, for each side (m).
-        frame: normal and tangents.
-        axes: motions of unit joint velocities.
-        friction: μ of each tangent of a pyramid with the edges n ± μ t; None for frictionless and elliptic contacts.
     """
 
-    lever: Float[Array, "contacts sides 3 *batch"]
-    frame: Float[Array, "contacts 3 3 *batch"]
-    axes: Float[Array, "nv 6 *batch"]
-    friction: Float[Array, "contacts tangents *batch"] | None
+    lever: Float[Array, "contacts sides 3 *batch"]  # from that centre to the contact point (m)
+    frame: Float[Array, "contacts 3 3 *batch"]  # normal and tangents
+    axes: Float[Array, "nv 6 *batch"]  # motions of unit joint velocities
+    friction: Float[Array, "contacts tangents *batch"] | None  # μ of a pyramid's tangents, with the edges n ± μ t
     sides: tuple[tuple[Side, ...], ...] = eqx.field(static=True)
     dim: int = eqx.field(static=True)
 
@@ -372,5 +358,4 @@ def _spread(
 
 
 def _selection(dofs: tuple[int, ...], num_dofs: int) -> np.ndarray:
-    """Return the matrix that selects joint velocities."""
     return (np.array(dofs, int)[:, None] == np.arange(num_dofs)).astype(float)

@@ -18,7 +18,7 @@ an update along the line would keep rounding errors from a poor start.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -31,8 +31,8 @@ from mjxgrad.batched import device, linear, on_gpu
 from mjxgrad.bodies.kinematics import Inertia
 from mjxgrad.solver import constraint, hessian
 from mjxgrad.solver.constraint import RowLayout, Rows
+from mjxgrad.solver.hessian import SparseRows, num_dense_rows
 from mjxgrad.solver.jacobian import JoinedRows, RowMap
-from mjxgrad.solver.sparse import SparseRows, num_dense_rows
 
 _Vector = Float[Array, "nv *batch"]
 _OfRows = PyTree[Float[Array, "_ *batch"]]
@@ -65,57 +65,24 @@ _RESOLVED = 1e-3
 
 
 class Variant(eqx.Module):
-    """The differences between two solves of one state. For two solves arrays have a leading axis of two.
+    """The differences between two solves of one state. For two solves arrays have a leading axis of two."""
 
-    Attributes:
-        weight: weights D of the rows.
-        reference: a_ref of the rows; None keeps the system's.
-        parts: parts of J to replace, where contacts may act from another side.
-    """
-
-    weight: Float[Array, "*two rows"]
-    reference: Float[Array, "*two rows"] | None = None
-    parts: tuple[RowMap | None, ...] | None = None
+    weight: Float[Array, "*two rows"]  # weights D of the rows
+    reference: Float[Array, "*two rows"] | None = None  # a_ref of the rows; None keeps the system's
+    parts: tuple[RowMap | None, ...] | None = None  # parts of J to replace, where contacts may act from another side
 
     def __getitem__(self, number: int) -> "Variant":
-        """Return the variant of one solve."""
         return jax.tree.map(lambda x: x[number], self)
 
 
-@jax.tree_util.register_pytree_node_class
-@dataclasses.dataclass(frozen=True)
-class System:
-    """The equations of motion of one state, in a form that can be differentiated.
+class System(eqx.Module):
+    """The equations of motion of one state, in a form that can be differentiated."""
 
-    As a pytree it is a list of arrays, without the None of parts that are absent; see `linear.batch_last`.
-
-    Attributes:
-        inertia: M.
-        force: f_smooth, all forces except those of constraints (N or N m).
-        map: J, inactive rows included.
-        is_active: whether each row is active.
-        rows: parameters of the rows' laws.
-    """
-
-    inertia: Inertia
-    force: _Vector
-    map: JoinedRows
+    inertia: Inertia  # M
+    force: _Vector  # f_smooth, all forces except those of constraints (N or N m)
+    map: JoinedRows  # J, inactive rows included
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
-
-    def tree_flatten(self) -> tuple[Sequence[Any], Any]:
-        """Return the arrays and the structure that holds them."""
-        # JAX may have put None in place of arrays: only the structure that was kept tells them from absent parts.
-        fields = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return vars(self).get("_flat") or jax.tree.flatten(tuple(fields))
-
-    @classmethod
-    def tree_unflatten(cls, structure: Any, leaves: Any) -> "System":
-        """Return a system from its arrays; not by the constructor, whose check of shapes fails under `jax.vmap`."""
-        self = object.__new__(cls)
-        names = (field.name for field in dataclasses.fields(cls))
-        vars(self).update(zip(names, jax.tree.unflatten(structure, leaves), strict=True), _flat=(leaves, structure))
-        return self
 
     def mv(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
@@ -227,7 +194,7 @@ _Parts = tuple[Float[Array, " height"], *tuple[Float[Array, " width"], ...]]
 
 
 class _KernelRows(NamedTuple):
-    """Parameters of uncoupled rows, whose forces are -D x between bounds; parts as in `_KernelProblem`."""
+    """Parameters of uncoupled rows, whose forces are -D x between bounds."""
 
     reference: _Parts
     weight: _Parts

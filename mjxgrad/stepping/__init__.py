@@ -15,21 +15,3 @@ from mjxgrad.stepping.contact import (
 from mjxgrad.stepping.rows import contact_force
 from mjxgrad.stepping.smoothing import smoothing_warnings
 from mjxgrad.stepping.step import forward, solve, step
-
-__all__ = [
-    "Contact",
-    "Discrete",
-    "Engine",
-    "Gradient",
-    "Onset",
-    "OwnMotion",
-    "Slope",
-    "Smoothing",
-    "check_contact",
-    "contact_force",
-    "forward",
-    "own_motion",
-    "smoothing_warnings",
-    "solve",
-    "step",
-]

@@ -37,7 +37,6 @@ class OwnMotion(eqx.Module):
     gradient: ClassVar[Gradient]
 
     def __check_init__(self):
-        """Refuse unknown engines."""
         if self.engine is not None and self.engine not in get_args(Engine):
             raise ValueError(f'engine must be "mjx", "mujoco" or None, got {self.engine!r}')
 
@@ -73,15 +72,7 @@ def own_motion(gradient: str, engine: str | None = None) -> Discrete | Slope:
 
 
 def check_contact(contact: Any, *, is_step: bool = False) -> None:
-    """Refuse anything but one of the four records, and lengths with a leading axis.
-
-    Args:
-        contact: the argument to check.
-        is_step: whether it is for a step of MJX, which C MuJoCo cannot take.
-
-    Raises:
-        ValueError: if it is no such record, a length or width of it is no single number, or the engine does not fit.
-    """
+    """Refuse anything but one of the four records, lengths with a leading axis, and in a step of MJX the engine of C MuJoCo."""
     if not isinstance(contact, Contact):
         given = f'"{contact}"' if isinstance(contact, str) else repr(contact)
         raise ValueError(f"contact must be mg.Discrete(), mg.Slope(), mg.Onset() or mg.Smoothing(), got {given}")

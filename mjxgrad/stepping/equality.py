@@ -17,6 +17,7 @@ from mjxgrad.contact.law import impedance
 from mjxgrad.solver.jacobian import DenseRows
 from mjxgrad.stepping.rows import Block, contact_jacobian, per_row
 
+_Column = Float[Array, " n"]
 _Ends = Float[Array, "constraints 2 3"]
 
 
@@ -148,9 +149,7 @@ def _weld(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     return _block(model, data, ids, jacobian, residual, jnp.repeat(weight, 3, axis=1), drift)
 
 
-def _polynomial(
-    coefficients: Float[Array, "n 5"], x: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def _polynomial(coefficients: Float[Array, "n 5"], x: _Column) -> tuple[_Column, _Column]:
     """Return a quartic and its derivative by Horner's rule, without powers of zero, which have no derivative."""
     value, slope = coefficients[:, 4], jnp.zeros_like(x)
     for k in (3, 2, 1, 0):

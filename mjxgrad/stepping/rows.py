@@ -28,35 +28,21 @@ _PerRow = Float[Array, " rows"]
 
 
 class Block(eqx.Module):
-    """Constraint rows of one kind, before gating and scaling. All fields have the rows as leading axis.
+    """Constraint rows of one kind, before gating and scaling. All arrays have the rows as leading axis."""
 
-    Attributes:
-        map: J, from joint velocities to the rows, inactive rows included.
-        residual: r in a_ref (m or rad).
-        impedance: d(r), with dw and d0.
-        solimp: parameters of the impedance.
-        inverse_weight: Â, inverse inertia (1/kg).
-        solref: stiffness and damping in MuJoCo's formats.
-        margin: distance at which the row begins (m or rad).
-        friction_loss: largest force of a friction loss row.
-        is_active: whether the row takes part.
-        drift: J̇ v, the change of the rate without joint accelerations (m/s² or rad/s²); None where it is not used.
-        rows_each: number of consecutive rows of each contact or limit, which begin and end together; 0 if none does.
-        is_pyramid: whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
-        is_contact: whether the rows belong to contacts.
-    """
-
-    map: RowMap
-    residual: _PerRow
-    impedance: Impedance
+    map: RowMap  # J, from joint velocities to the rows, inactive rows included
+    residual: _PerRow  # r in a_ref (m or rad)
+    impedance: Impedance  # d(r), with dw and d0
     solimp: Float[Array, "rows 5"]
-    inverse_weight: _PerRow
+    inverse_weight: _PerRow  # Â, inverse inertia (1/kg)
     solref: Float[Array, "rows 2"]
-    margin: _PerRow
-    friction_loss: _PerRow
+    margin: _PerRow  # distance at which the row begins (m or rad)
+    friction_loss: _PerRow  # largest force of a friction loss row
     is_active: Bool[Array, " rows"]
-    drift: _PerRow | None = None
+    drift: _PerRow | None = None  # J̇ v, the change of the rate without joint accelerations (m/s² or rad/s²)
+    # Number of consecutive rows of each contact or limit, which begin and end together; 0 if none does.
     rows_each: int = eqx.field(static=True, default=0, kw_only=True)
+    # Whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
     is_pyramid: bool = eqx.field(static=True, default=False, kw_only=True)
     is_contact: bool = eqx.field(static=True, default=False, kw_only=True)
 
@@ -153,12 +139,29 @@ def _cone_rows(
 
 
 def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int) -> RowMap:
-    """Return the map of consecutive contacts of one dimension, from slot `first` on."""
+    """Return the map of consecutive contacts of one dimension, from slot `first` on.
+
+    A row of a contact between known bodies is their relative velocity at a point.
+    """
     friction = contact.friction[:, : dim - 1] if has_pyramids(model, dim) else None
     bodies = _bodies(model, data, contact, first)
-    if isinstance(bodies, np.ndarray):
-        return contact_rows(model, data, contact, bodies, dim, friction)
-    return SlotRows(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
+    if not isinstance(bodies, np.ndarray):
+        return SlotRows(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
+    moves = tree.moving_dofs(model)
+    shares_root = model.body_rootid[bodies[:, 0]] == model.body_rootid[bodies[:, 1]]
+    own = moves[bodies]
+    own = own * (1 - own[:, ::-1] * shares_root[:, None, None])
+    # Moving sides come first; the second is needed only for contacts of two moving bodies.
+    order = np.argsort(~own.any(axis=2), axis=1, kind="stable")
+    num_sides = max(1, int(own.any(axis=2).sum(axis=1).max()))
+    order = order[:, :num_sides]
+    sides = tuple(
+        tuple(Side(2.0 * k - 1, tuple(int(dof) for dof in np.nonzero(own[slot, k])[0])) for k in of_slot)
+        for slot, of_slot in enumerate(order)
+    )
+    roots = model.body_rootid[np.take_along_axis(bodies, order, axis=1)]
+    centre = maps.pick(roots.reshape(-1), data.subtree_com).reshape(*roots.shape, 3)
+    return ContactRows(contact.pos[:, None] - centre, contact.frame, data.cdof, friction, sides, dim)
 
 
 def has_pyramids(model: mjx.Model, dim: int) -> bool:
@@ -177,27 +180,6 @@ def _bodies(model: mjx.Model, data: mjx.Data, contact: Any, first: int) -> np.nd
 def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contacts 5"]:
     """Return friction, clamped from below as in C MuJoCo: a cone of zero width has no interior."""
     return jnp.where(friction > mujoco.mjMINMU, friction, mujoco.mjMINMU)
-
-
-def contact_rows(
-    model: mjx.Model, data: mjx.Data, contact: Any, bodies: np.ndarray, dim: int, friction: Array | None
-) -> ContactRows:
-    """Return the rows of contacts between known bodies, the relative velocity of the two at a point."""
-    moves = tree.moving_dofs(model)
-    shares_root = model.body_rootid[bodies[:, 0]] == model.body_rootid[bodies[:, 1]]
-    own = moves[bodies]
-    own = own * (1 - own[:, ::-1] * shares_root[:, None, None])
-    # Moving sides come first; the second is needed only for contacts of two moving bodies.
-    order = np.argsort(~own.any(axis=2), axis=1, kind="stable")
-    num_sides = max(1, int(own.any(axis=2).sum(axis=1).max()))
-    order = order[:, :num_sides]
-    sides = tuple(
-        tuple(Side(2.0 * k - 1, tuple(int(dof) for dof in np.nonzero(own[slot, k])[0])) for k in of_slot)
-        for slot, of_slot in enumerate(order)
-    )
-    roots = model.body_rootid[np.take_along_axis(bodies, order, axis=1)]
-    centre = maps.pick(roots.reshape(-1), data.subtree_com).reshape(*roots.shape, 3)
-    return ContactRows(contact.pos[:, None] - centre, contact.frame, data.cdof, friction, sides, dim)
 
 
 def contact_jacobian(
@@ -229,15 +211,10 @@ def contact_jacobian(
 
 
 def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> Float[Array, "3"]:
-    """Return the force that one geom exerts on another through all their contacts.
+    """Return the force that the first geom exerts on the second through all their contacts.
 
-    It is meant for `observe=` of a rollout: `lambda model, data: mg.contact_force(model, data, "floor", "foot")`.
-
-    Args:
-        model: the model of the scene.
-        data: data with constraint forces, as returned by `forward`, a step or a rollout.
-        first: name of the geom that exerts the force.
-        second: name of the geom that receives it.
+    It is meant for `observe=` of a rollout: `lambda model, data: mg.contact_force(model, data, "floor", "foot")`. The data has
+    constraint forces, as after `forward` or a step.
 
     Returns:
         The force in world coordinates (N); zero where they do not touch. It does not include torques of friction.

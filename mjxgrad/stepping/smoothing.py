@@ -70,7 +70,6 @@ class Smoothing(eqx.Module):
     mode: str = eqx.field(static=True, default="forward")
 
     def __check_init__(self):
-        """Refuse an unknown mode, and a known length that is not positive and finite."""
         if self.mode not in get_args(Mode):
             raise ValueError(f"mode must be one of {', '.join(map(repr, get_args(Mode)))}, got {self.mode!r}")
         if is_known(self.length) and not np.all((np.asarray(self.length) > 0) & np.isfinite(self.length)):

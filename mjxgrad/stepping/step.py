@@ -92,13 +92,10 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
 
 
 def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> mjx.Data:
-    """Compute accelerations and forces of the present state; a drop-in for `mjx.forward`.
+    """Compute accelerations and forces of the present state; a drop-in for `mjx.forward`, with the arguments of `step`.
 
-    Args:
-        model: any model of MJX's JAX implementation.
-        data: the present state, controls and applied forces.
-        contact: how contact is stepped, as in `step`. With an onset, accelerations and forces are means over the coming time
-            step. `Slope` is `Discrete` here, since it is a derivative of whole steps.
+    With an onset, accelerations and forces are means over the coming time step. `Slope` is `Discrete` here, since it is a
+    derivative of whole steps.
 
     Returns:
         Data with every field that depends on the state filled in. Under forward smoothing the constraint rows (`efc_`) are the
@@ -113,11 +110,7 @@ def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) 
 
 
 def _forward(
-    model: mjx.Model,
-    data: mjx.Data,
-    contact: Contact,
-    after: _Vector | None = None,
-    rows: list[Block] | None = None,
+    model: mjx.Model, data: mjx.Data, contact: Contact, after: _Vector | None = None, rows: list[Block] | None = None
 ) -> mjx.Data:
     """Return data with all fields that depend on the state.
 
@@ -158,11 +151,9 @@ def _forward(
 def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute the acceleration and the constraint forces; a drop-in for `mjx.solve`.
 
-    The derivative is that of the converged solve, by the implicit function theorem; see `solver.implicit`.
-
-    Args:
-        model: the model; its `opt.iterations` and `opt.tolerance` bound the iterations.
-        data: data with mass matrix, smooth forces and constraint rows, as returned by `mjx.fwd_acceleration`.
+    The derivative is that of the converged solve, by the implicit function theorem; see `solver.implicit`. The model's
+    `opt.iterations` and `opt.tolerance` bound the iterations. The data has mass matrix, smooth forces and constraint rows, as
+    after `mjx.fwd_acceleration`.
 
     Returns:
         Data with `qacc`, `qfrc_constraint` and the rows' forces.
@@ -190,7 +181,6 @@ def _solver_settings(model: mjx.Model, data: mjx.Data) -> tuple[int, _Vector, Fl
 
 
 def _unconstrained(data: mjx.Data) -> mjx.Data:
-    """Return data with the acceleration without constraints."""
     data = data.replace(qacc=data.qacc_smooth, qfrc_constraint=jnp.zeros_like(data.qvel))
     return data.tree_replace({"_impl.solver_niter": jnp.zeros_like(data._impl.solver_niter)})  # pyright: ignore[reportReturnType]
 

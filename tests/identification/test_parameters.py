@@ -8,8 +8,15 @@ import pytest
 import mjxgrad as mg
 from mjxgrad import identification
 from mjxgrad.bodies.spatial import rotation_matrix
-from mjxgrad.identification.inertia import body_fields, logarithms, pseudo_inertia, second_moments
-from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
+from mjxgrad.identification.parameters import (
+    Coordinates,
+    Parameter,
+    body_fields,
+    logarithms,
+    pseudo_inertia,
+    second_moments,
+    write_all,
+)
 
 _SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1" friction=".4"/>
   <body name="arm" pos="0 0 1"><joint name="hinge" axis="0 1 0" damping="2" armature=".3"/>

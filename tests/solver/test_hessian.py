@@ -9,8 +9,8 @@ import pytest
 
 from mjxgrad.solver import hessian
 from mjxgrad.solver.constraint import ConeGroup, RowHessian, RowLayout
+from mjxgrad.solver.hessian import SparseRows
 from mjxgrad.solver.jacobian import Group
-from mjxgrad.solver.sparse import SparseRows
 
 # Every kind of group: equality, joint limits, frictionless contacts and pyramids, or elliptic contacts.
 _SIMPLE = (Group((0, 1, 3), 1, 3), Group((1, 4), 2, is_diagonal=True), Group((0, 2), 2))

@@ -17,8 +17,8 @@ from mjxgrad.bodies.kinematics import inertia_of
 from mjxgrad.contact.collision import collide
 from mjxgrad.solver import constraint
 from mjxgrad.solver.constraint import RowHessian
+from mjxgrad.solver.hessian import SparseRows
 from mjxgrad.solver.jacobian import AxisRows, ContactRows
-from mjxgrad.solver.sparse import SparseRows
 from mjxgrad.stepping import assembly
 from mjxgrad.stepping.rows import joined
 
@@ -92,7 +92,7 @@ def test_rows_as_a_map_are_their_matrix_and_its_transpose(rows, random):
 @pytest.mark.parametrize("batch", [(), (3,)], ids=["one", "batch"])
 def test_sparse_rows_are_the_matrix_without_its_zeros(rows, random, batch, most_groups, monkeypatch):
     """J x, Jᵀ f and M + Jᵀ S J of the rows that act, for one state and with a trailing batch."""
-    monkeypatch.setattr("mjxgrad.solver.sparse._MOST_GROUPS", most_groups)
+    monkeypatch.setattr("mjxgrad.solver.hessian._MOST_GROUPS", most_groups)
     model, data, block, matrix = rows
     layout, count = assembly.row_layout(model, data), len(matrix)
     matrix = np.where(block.is_active[:, None], matrix, 0)

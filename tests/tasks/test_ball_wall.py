@@ -10,8 +10,7 @@ from mjxgrad.estimators import first_and_zeroth_order
 from mjxgrad.objective import closed_loop
 from mjxgrad.rollouts import initial_state, rollout
 from mjxgrad.scene import load_scene
-from mjxgrad.tasks import SceneTask, ball_wall, scene_path
-from mjxgrad.tasks.ball_wall import wall_softness
+from mjxgrad.tasks import SceneTask, ball_wall, scene_path, wall_softness
 from tests.objective.test_task import CART
 
 ANGLES = np.concatenate([np.arange(0.3, 1.2, 0.02), [0.612, 0.614]])

@@ -11,7 +11,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.stepping import own_motion
-from mjxgrad.tasks.hopper import DAMPING, START_POSE, STIFFNESS, hopper
+from mjxgrad.tasks import DAMPING, START_POSE, STIFFNESS, hopper
 
 HORIZON = 60  # until 0.12 s, 25 steps after the foot touches
 
