@@ -55,6 +55,8 @@ class Sizes(SettingsTable):
     """Of each policy."""
     num_episodes: Annotated[int, Field(ge=1)] = 16
     """Of each policy in C MuJoCo, by which it is judged."""
+    ppo_steps: Positive = 1.0
+    """Factor of the steps that PPO takes: three times as many last about as long as those of the others."""
 
 
 class Settings(RunSettings):
@@ -97,6 +99,10 @@ class Settings(RunSettings):
     def num_steps(self) -> int:
         """Steps that a policy learns from in one update."""
         return self.sizes.num_environments * self.window
+
+    def steps_of(self, method: Method) -> float:
+        """Return the steps that a method takes for an update of the others."""
+        return self.num_steps * (self.sizes.ppo_steps if method == "ppo" else 1.0)
 
 
 History = dict[str, Float[np.ndarray, "updates seeds"]]
@@ -237,22 +243,21 @@ def _act(policy: learning.Policy, obs):
 def _by_ppo(
     settings: Settings, environment: Environment, advance_to: Callable[[int], None]
 ) -> tuple[Any, ppo.Act, History]:
-    """Learn by PPO, a policy after the other, from as many steps as the others; what it does not measure is NaN."""
+    """Learn by PPO, a policy after the other; what it does not measure is NaN."""
     num_seeds, num_updates = settings.sizes.num_seeds, settings.sizes.num_updates
-    learned, acts, rewards, seconds = [], [], [], 0.0
+    learned, acts, rewards, seconds, each = [], [], [], 0.0, settings.steps_of("ppo")
     for seed in range(num_seeds):
         params, act, course = ppo.learn_ppo(
+            settings.environment,
             environment,
             settings.seed + seed,
-            num_steps=num_updates * settings.num_steps,
-            num_environments=settings.sizes.num_environments,
-            window=settings.window,
-            report=lambda steps, s=seed: advance_to((s * num_updates + steps // settings.num_steps) // num_seeds),
+            num_steps=round(num_updates * each),
+            report=lambda steps, s=seed: advance_to(int(s * num_updates + steps / each) // num_seeds),
         )
         learned.append(params)
         acts.append(act)
         seconds += course["seconds"][-1]
-        rewards.append(np.interp(settings.num_steps * np.arange(1, num_updates + 1), course["steps"], course["reward"]))
+        rewards.append(np.interp(each * np.arange(1, num_updates + 1), course["steps"], course["reward"]))
     reward = np.stack(rewards, axis=1)
     known = {"reward": reward, "seconds": np.full_like(reward, seconds / num_updates)}
     counts = {name: np.zeros_like(reward) for name in ("not_finite", "skipped", "diverged", "shortened")}
@@ -460,7 +465,7 @@ def course_of_learning(outcome: Outcome):
     updates = np.arange(1, settings.sizes.num_updates + 1)
     for course in shown:
         look, label = {"color": _COLOURS[course.method]}, NAMES[course.method]
-        scales = (settings.num_steps, course.seconds)
+        scales = (settings.steps_of(course.method), course.seconds)
         for axis, scale in zip(axes[0], scales, strict=True):
             axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
             axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)

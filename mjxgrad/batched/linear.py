@@ -8,7 +8,7 @@ does not vectorise a reduction along the remaining batch axis.
 import functools
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -75,38 +75,37 @@ def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch
 def batch_last(function: Callable, batch: int | None = None) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    The function takes and returns pytrees of arrays. Nested batches are merged into one axis, which makes longer vectors and
-    arrays of lower rank; `batch` is the size of a trailing axis that the arrays have already.
+    Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank.
+
+    Args:
+        function: takes and returns pytrees of arrays. The arguments must not contain None: the forward mode of `custom_vmap`,
+            which `jax.hessian` uses, takes it for an array (jax 0.10.2).
+        batch: the size of a trailing axis that the arrays have already; None without one.
     """
     # Under `jax.jit` constants stay inside. `custom_vmap` refuses to batch constants, which `jax.lax.cond` requires
     # where its condition differs between members of the batch.
-    compiled = jax.jit(function)
+    batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
-    def call(*args: PyTree) -> PyTree:
-        # Leaves alone: the forward mode of `custom_vmap`, which `jax.hessian` uses, takes None for an array (jax 0.10.2).
+    @batched.def_vmap
+    def rule(size, is_batched, *args):
+        has_batch = jax.tree.leaves(is_batched)
+        if not any(has_batch):  # in forward mode, where only the tangents are batched
+            result = function(*args)
+            return result, jax.tree.map(lambda _: False, result)
+
+        def back(x: Array) -> Array:
+            split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
+            return jnp.moveaxis(split, -1, 0)
+
         leaves, structure = jax.tree.flatten(args)
-        batched = jax.custom_batching.custom_vmap(lambda *leaves: compiled(*jax.tree.unflatten(structure, leaves)))
+        moved = _moved_last(leaves, has_batch, size)
+        if batch is not None:
+            moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
+        merged = batch_last(function, size if batch is None else batch * size)
+        result = merged(*jax.tree.unflatten(structure, moved))
+        return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
-        @batched.def_vmap
-        def rule(size, has_batch, *leaves):
-            if not any(has_batch):  # in forward mode, where only the tangents are batched
-                result = function(*jax.tree.unflatten(structure, leaves))
-                return result, jax.tree.map(lambda _: False, result)
-
-            def back(x: Array) -> Array:
-                split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
-                return jnp.moveaxis(split, -1, 0)
-
-            moved = _moved_last(leaves, has_batch, size)
-            if batch is not None:
-                moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
-            merged = batch_last(function, size if batch is None else batch * size)
-            result = merged(*jax.tree.unflatten(structure, moved))
-            return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
-
-        return batched(*leaves)
-
-    return call
+    return batched
 
 
 def solve_subset(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
@@ -152,7 +151,7 @@ class Subset:
         return jax.tree.map(put, whole, part)
 
 
-def _moved_last(leaves: Sequence[Array], is_batched: Sequence[bool], size: int) -> list[Array]:
+def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[Array]:
     """Return arrays with the batch as trailing axis; batched arrays of one type are moved in one operation."""
     moved = [
         None if has_batch else jnp.broadcast_to(x[..., None], (*x.shape, size))

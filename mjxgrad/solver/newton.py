@@ -18,7 +18,7 @@ an update along the line would keep rounding errors from a poor start.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -75,14 +75,33 @@ class Variant(eqx.Module):
         return jax.tree.map(lambda x: x[number], self)
 
 
-class System(eqx.Module):
-    """The equations of motion of one state, in a form that can be differentiated."""
+@jax.tree_util.register_pytree_node_class
+@dataclasses.dataclass(frozen=True)
+class System:
+    """The equations of motion of one state, in a form that can be differentiated.
+
+    As a pytree it is a list of arrays, without the None of parts that are absent; see `linear.batch_last`.
+    """
 
     inertia: Inertia  # M
     force: _Vector  # f_smooth, all forces except those of constraints (N or N m)
     map: JoinedRows  # J, inactive rows included
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
+
+    def tree_flatten(self) -> tuple[Sequence[Any], Any]:
+        """Return the arrays and the structure that holds them."""
+        # JAX may have put None in place of arrays: only the structure that was kept tells them from absent parts.
+        fields = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return vars(self).get("_flat") or jax.tree.flatten(tuple(fields))
+
+    @classmethod
+    def tree_unflatten(cls, structure: Any, leaves: Any) -> "System":
+        """Return a system from its arrays; not by the constructor, whose check of shapes fails under `jax.vmap`."""
+        self = object.__new__(cls)
+        names = (field.name for field in dataclasses.fields(cls))
+        vars(self).update(zip(names, jax.tree.unflatten(structure, leaves), strict=True), _flat=(leaves, structure))
+        return self
 
     def mv(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
