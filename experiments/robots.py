@@ -9,7 +9,7 @@ limit or contact is exactly at its surface, where a derivative has two values.
 - `c_*`, `mjx_*`: one step by either engine, in both precisions. The motion against `mj_step` of the file itself, and A and B, by
   reverse mode, against `mjd_transitionFD` (for RK4, which that refuses, central differences of `mj_step`). C's engine takes its
   own A and B from that function, so there the comparison is of what JAX makes of them.
-- `slope_single`: 50 steps by C's engine. The mean derivative, `mg.Slope`, against the slope of the motion over 33 to 513
+- `slope_single`: 50 steps by C's engine. The mean derivative, `mg.Slope`, against the slope of the motion over 33 to 2049
   starts. "consistent": within two standard errors, which are wide; "ill-defined": apart, but over so few steps' phases that there
   is no slope to speak of; "flagged": off where `Trajectory.explodes` says so.
 
@@ -48,9 +48,10 @@ PACKAGES = {one.partition("==")[0]: one for one in _PINNED.split()}
 _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 # What a solve leaves is divided by the width of a difference: of 1e-12 as much as 2e-3 of A was left, for stiff contact.
 _SOLVE, _WIDTH = 1e-15, 1e-6
-_HORIZON, _INTERVAL = 50, (-0.25, 0.25)
-_PHASES = (33, 129, 513)  # starts, and how many where fewer do not tell
-_LONGEST = 12.0  # s, after which no more starts are taken
+_HORIZON = 50
+_REACHES = (0.25, 1.0)  # of starts to either side; the second where the first covers too few steps' phases
+_PHASES = (33, 129, 513, 2049)  # starts, and how many where fewer do not tell
+_LONGEST = 40.0  # s, after which no more starts are taken
 _WILD = 10.0  # scatter of single derivatives over the slope, from which flags are asked for
 _FEWEST_TEETH = 4  # steps' phases that starts must cover
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
@@ -175,17 +176,22 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
     names = "slope mean standard_error resolution num_teeth spread num_finite"
     shown: dict[str, Any] = {"steps": "off"}
-    begin = time.perf_counter()
-    for count in _PHASES:  # each takes four times as long as the one before
-        if shown["steps"] in ("off", "consistent") and time.perf_counter() - begin < _LONGEST:
-            outcomes, _, gradients = _along(model, scene, places := phases(_INTERVAL, count))
-            found = compare_to_slope(places, outcomes, [gradients], ("slope",))
-            shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()} | {"starts": count}
-            shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
+    for reach in _REACHES:
+        begin, shown["steps"] = time.perf_counter(), "off"
+        for count in _PHASES:  # each takes four times as long as the one before
+            if shown["steps"] in ("off", "consistent") and time.perf_counter() - begin < _LONGEST:
+                outcomes, _, gradients = _along(model, scene, places := phases((-reach, reach), count))
+                found = compare_to_slope(places, outcomes, [gradients], ("slope",))
+                shown = {name: np.asarray(getattr(found, name)).item() for name in names.split()}
+                shown |= {"starts": count, "reach": reach}
+                shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
+        if shown["steps"] != "ill-defined":
+            break
     is_wild = shown["steps"] in ("consistent", "ill-defined")
     is_wild &= shown["spread"] > _WILD * max(abs(shown["slope"]), shown["resolution"])
     if shown["steps"] == "off" or shown["lost"] or is_wild:
-        outcomes, flags, gradients = _along(model, scene, phases(_INTERVAL, _PHASES[0]), measure_growth=True)
+        places = phases((-shown["reach"], shown["reach"]), _PHASES[0])
+        outcomes, flags, gradients = _along(model, scene, places, measure_growth=True)
         shown["lost"] = int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients) & ~flags))
         shown["steps"] = "flagged" if flags.any() else shown["steps"]
     return shown
