@@ -80,15 +80,40 @@ def roll_out(
     return found["qpos"], found["qvel"], found["act"]
 
 
-def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
-    """Return the Jacobians of one step by "state" and "ctrl", and those of its sensors, "C" and "D"; see `roll_out`."""
-    before = {name: x[None] for name, x in start.items()}
-    found = _jacobians(engine_of(scene.mj_model), gradient, ("ctrl", "C", "D"), changed_numbers(scene), before, inputs)
+def steer(
+    scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int
+) -> tuple[Float[Array, "horizon+1 state"], Float[Array, "horizon nu"]]:
+    """Return states and controls of a feedback law in one call, see `Engine.steer`; resting inputs belong to the start."""
+    engine, first = engine_of(scene.mj_model), jnp.concatenate([start[name] for name in ("qpos", "qvel", "act")])
+    shapes = {"states": (len(law["controls"]), first.size), "controls": law["controls"].shape}
+    shapes = {name: jax.ShapeDtypeStruct(shape, first.dtype) for name, shape in shapes.items()}
+    function = functools.partial(engine.steer, num_substeps, first.dtype)
+    found = _callback(function, shapes, changed_numbers(scene), start, law)
+    return jnp.concatenate([first[None], found["states"]]), found["controls"]
+
+
+def linearise(
+    scene: Scene,
+    start: _Arrays,
+    inputs: _Arrays,
+    gradient: Gradient,
+    wanted: tuple[str, ...] = ("ctrl", "C", "D"),
+    num_substeps: int = 1,
+) -> dict[str, Array]:
+    """Return the Jacobians of one step by "state", "ctrl" and what else is wanted, see `Engine.linearise` and `roll_out`."""
+    before, numbers = {name: x[None] for name, x in start.items()}, changed_numbers(scene)
+    found = _jacobians(engine_of(scene.mj_model), gradient, wanted, numbers, before, inputs, num_substeps)
     return {name: value[0] for name, value in found.items()}
 
 
 def _jacobians(
-    engine: Engine, gradient: Gradient, wanted: tuple[str, ...], numbers: _Arrays, before: _Arrays, inputs: _Arrays
+    engine: Engine,
+    gradient: Gradient,
+    wanted: tuple[str, ...],
+    numbers: _Arrays,
+    before: _Arrays,
+    inputs: _Arrays,
+    num_substeps: int = 1,
 ) -> dict[str, Array]:
     """Return what `Engine.linearise` gives of states before each step; it has no derivative of its own."""
     horizon, dtype = len(inputs["ctrl"]), before["qpos"].dtype
@@ -98,7 +123,9 @@ def _jacobians(
 
     @jax.custom_jvp
     def call(numbers, before, inputs):
-        return _callback(functools.partial(engine.linearise, gradient, wanted), shapes, numbers, before, inputs)
+        return _callback(
+            functools.partial(engine.linearise, gradient, wanted, num_substeps), shapes, numbers, before, inputs
+        )
 
     @call.defjvp
     def _refuse(primals, tangents):

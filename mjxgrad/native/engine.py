@@ -6,7 +6,7 @@ import functools
 import math
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -24,6 +24,7 @@ INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "moc
 START = ("time", "qpos", "qvel", "act")
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
+_MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE_ACT.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
@@ -46,7 +47,6 @@ class Engine:
     def __init__(self, mj_model: mujoco.MjModel):
         self.mj_model, self.lock = mj_model, threading.Lock()
         self.pool, self.threads = mujoco.rollout.Rollout(nthread=_NUM_THREADS), ThreadPoolExecutor(_NUM_THREADS)
-        self.data = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
         self.start = mujoco.MjData(mj_model)
         self.plain = copy.deepcopy(mj_model)
         # A state that is not finite stays so, and is seen.
@@ -58,6 +58,7 @@ class Engine:
         self.places = {
             name: slice(begins[name], begins[name] + mujoco.mj_stateSize(mj_model, bit)) for name, bit in bits.items()
         }
+        self.workers = [_Worker(self) for _ in range(_NUM_THREADS)]
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
         """Return positions, velocities and activations after each step."""
@@ -70,17 +71,66 @@ class Engine:
                 place = self.places[name].start - self.places["ctrl"].start
                 width = math.prod(value.shape[2:])
                 given[..., place : place + width] = value.reshape(*value.shape[:2], width)
-            found = self.pool.rollout(models, self.data, full, given, control_spec=_USER)[0]
+            found = self.pool.rollout(models, [one.data for one in self.workers], full, given, control_spec=_USER)[0]
         ends = np.cumsum([1, self.mj_model.nq, self.mj_model.nv, self.mj_model.na])
         parts = np.split(np.asarray(found), ends, axis=2)[1:4]
         return {name: part.reshape(*batch, *part.shape[1:]) for name, part in zip(START[1:], parts, strict=True)}
 
+    def steer(
+        self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
+    ) -> dict[str, np.ndarray]:
+        """Return the states after each step of a feedback law, which holds a control for some time steps, and the controls.
+
+        The law has the fields of `planning.Law`. Controls are rounded to a type, so that their rollout is the same motion.
+        """
+        with self.lock, collected():
+            batch, models, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
+            nq, nv, rows = self.mj_model.nq, self.mj_model.nv, self._rows(start)
+            motion = rows[:, self.places["qpos"].start : self.places["act"].stop]
+            found = {"states": np.zeros((*law["controls"].shape[:2], motion.shape[1]))}
+            found["controls"] = np.zeros(law["controls"].shape, dtype)
+
+            @np.errstate(invalid="ignore", over="ignore")
+            def work(one: _Worker, piece: range) -> None:
+                part = slice(piece.start, piece.stop)
+                given, now, own, row = {k: v[part] for k, v in law.items()}, motion[part], models[part], rows[part]
+                away, ctrl, follows = (
+                    np.zeros((len(piece), given["gain"].shape[3])),
+                    row[:, self.places["ctrl"]],
+                    given["follows"][:, None],
+                )
+                for t in range(given["controls"].shape[1]):
+                    nominal = given["states"][:, t]
+                    for change, start, end in zip(away[:, :nv], nominal[:, :nq], now[:, :nq], strict=True):
+                        mujoco.mj_differentiatePos(self.mj_model, change, 1.0, start, end)
+                    np.subtract(now[:, nq:], nominal[:, nq:], out=away[:, nv:])
+                    corrected = np.where(follows, (given["gain"][:, t] @ away[:, :, None])[..., 0], 0.0)
+                    corrected += given["controls"][:, t]
+                    chosen = found["controls"][part, t]
+                    np.minimum(np.maximum(corrected, given["lower"]), given["upper"], out=chosen)
+                    ctrl[:] = chosen
+                    for model, state in zip(own, row, strict=True):
+                        mujoco.mj_setState(model, one.data, state, _ALL)
+                        mujoco.mj_step(model, one.data, num_substeps)
+                        mujoco.mj_getState(model, one.data, state, _ALL)
+                    found["states"][part, t] = now
+
+            self._share(work, len(models))
+        return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
+
     def linearise(
-        self, gradient: Gradient, wanted: tuple[str, ...], numbers: _Arrays, start: _Arrays, inputs: _Arrays
+        self,
+        gradient: Gradient,
+        wanted: tuple[str, ...],
+        num_substeps: int,
+        numbers: _Arrays,
+        start: _Arrays,
+        inputs: _Arrays,
     ) -> dict[str, np.ndarray]:
         """Return the Jacobians of single steps in tangent space, by "state" and by each input and number that is wanted.
 
-        Those of the sensors, "C" and "D", are of small differences with either gradient.
+        Those of the sensors, "C" and "D", are of small differences with either gradient. A step may be several of MuJoCo's
+        under the same input; "end" is the state after it, not finite where there is none.
 
         States before each step are in `start`, with an axis of steps as inputs have it.
         """
@@ -90,16 +140,18 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            found = {k: np.zeros((len(rows), *shape)) for k, shape in self.shapes(wanted, sizes).items()}
-            pieces = np.array_split(np.arange(len(rows)), min(_NUM_THREADS, len(rows)))
-
-            def work(thread: int) -> None:
-                _Linearisation(self, self.data[thread], gradient).fill(
-                    models, start["qvel"], rows, pieces[thread], found
-                )
-
-            list(self.threads.map(work, range(len(pieces))))
-        return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in found.items()}
+            shapes = self.shapes(wanted, sizes).items()
+            found = {
+                k: np.full((num_substeps, len(rows), *shape), np.nan if k == "end" else 0.0) for k, shape in shapes
+            }
+            speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
+            self._share(lambda one, piece: one.fill(gradient, models, speeds, rows, piece, found), len(rows))
+        total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
+        for t in range(1, num_substeps):
+            for name in total.keys() - {"end", "state"}:
+                total[name] = found["state"][t] @ total[name] + found[name][t]
+            total["state"] = found["state"][t] @ total["state"]
+        return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in total.items()}
 
     def follow(
         self,
@@ -119,30 +171,34 @@ class Engine:
             sizes = {"qpos": model.nq, "qvel": model.nv, "act": model.na, "change": 2 * model.nv + model.na}
             found = {name: np.zeros((len(models), num_steps, size)) for name, size in sizes.items()}
             first = self._rows({**start, **{name: value[:, 0] for name, value in inputs.items()}})
+            speeds = self._reached(start["qvel"], num_steps)
 
-            # Speeds are not known before, so margins reach as far as those of twice the start's, or of a fall.
-            fall = num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity)
-            speeds = np.maximum(2 * np.abs(start["qvel"]), fall)
-
-            def work(piece: tuple[int, np.ndarray]) -> None:
-                one = _Linearisation(self, self.data[piece[0]], gradient)
-                for i in piece[1].tolist():
+            def work(one: _Worker, piece: range) -> None:
+                one.begin(gradient)
+                for i in piece:
                     one.use(models, i, speeds)
                     course = ({k: v[i] for k, v in inputs.items()}, changes[0][i], changes[1][i])
                     one.follow(first[i], *course, {k: v[i] for k, v in found.items()})
 
-            list(
-                self.threads.map(
-                    work, enumerate(np.array_split(np.arange(len(models)), min(_NUM_THREADS, len(models))))
-                )
-            )
+            self._share(work, len(models))
         return found
 
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, int]]:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
-        by_sensor = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu)}
-        return {"state": (size, size)} | {k: by_sensor[k] if k in by_sensor else (size, sizes[k]) for k in wanted}
+        own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
+        return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k]) for k in wanted}
+
+    def _share(self, work: Callable[["_Worker", range], None], count: int) -> None:
+        """Do so many things on all threads; each takes its piece of them."""
+        num = min(_NUM_THREADS, count)
+        pieces = [range(count)[count * i // num : count * (i + 1) // num] for i in range(num)]
+        list(map(work, self.workers, pieces) if len(pieces) == 1 else self.threads.map(work, self.workers, pieces))
+
+    def _reached(self, speeds: np.ndarray, num_steps: int) -> np.ndarray:
+        """Return speeds for margins in later steps, which are not known before: twice those of the start, or of a fall."""
+        model = self.mj_model
+        return np.maximum(2 * np.abs(speeds), num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity))
 
     def _flat(self, ndim: int, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> tuple:
         """Return the batch's shape, one model for each of it or for all, and the arrays with one axis for the batch's."""
@@ -181,33 +237,43 @@ class Engine:
         return found
 
 
-class _Linearisation:
-    """The Jacobians of steps by one thread."""
+class _Worker:
+    """The steps and Jacobians of one thread, which keeps its data and its copy of a model."""
 
-    def __init__(self, engine: Engine, data: mujoco.MjData, gradient: Gradient):
-        self.engine, self.data, self.gradient, self.places = engine, data, gradient, engine.places
+    def __init__(self, engine: Engine):
+        self.engine, self.data, self.places = engine, mujoco.MjData(engine.mj_model), engine.places
         self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
 
     @np.errstate(invalid="ignore", over="ignore")
-    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: np.ndarray, found: dict) -> None:
+    def fill(
+        self, gradient: Gradient, models: list, speeds: np.ndarray, rows: np.ndarray, index: range, found: dict
+    ) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
-        num_steps = len(rows) // len(models)
-        for i in index.tolist():
-            self.use(models, i // num_steps, speeds)
-            if np.isfinite(rows[i]).all():
-                self._one(self.models[1], rows[i].copy(), {name: value[i] for name, value in found.items()})
+        self.begin(gradient)
+        for i in index:
+            self.use(models, i // (len(rows) // len(models)), speeds)
+            after = rows[i]
+            for t in range(len(found["state"])):
+                if np.isfinite(after).all():
+                    after = self._one(
+                        self.models[1], after.copy(), {name: value[t, i] for name, value in found.items()}
+                    )
+
+    def begin(self, gradient: Gradient) -> None:
+        """Take a gradient for what follows."""
+        self.gradient, self.near_to = gradient, None
 
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
-        if models[index] is self.models[0]:
-            return
-        model = copy.deepcopy(models[index])
-        model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
-        self.models = (models[index], model)
-        if self.gradient == "slope":
-            alike = [k for k, one in enumerate(models) if one is models[index]]
+        given = models[index]
+        if given is not self.models[0]:
+            model = copy.deepcopy(given)
+            model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
+            self.models = (given, model)
+        if self.gradient == "slope" and given is not self.near_to:
+            alike, model = [k for k, one in enumerate(models) if one is given], self.models[1]
             self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
-            self.far = mujoco.MjData(self.surfaces.model)
+            self.near_to, self.far = given, mujoco.MjData(self.surfaces.model)
 
     @np.errstate(invalid="ignore", over="ignore")
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
@@ -241,15 +307,19 @@ class _Linearisation:
                 found[name][t] = value
             found["change"][t] = change
 
-    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
-        _, after, _ = self._step(model, row)
+    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray:
+        """Write the Jacobians of a step, and return the state after it."""
+        end, after = np.empty_like(row), self._step(model, row)[1]
+        mujoco.mj_getState(model, self.data, end, _ALL)
+        if "end" in found:
+            found["end"][:] = end[self.places["qpos"].start :][: len(found["end"])]
         if not np.isfinite(after).all():
-            return
+            return end
         row[self.places["warmstart"]] = self.data.qacc_warmstart
         model, near, spanned, clear = self._near(model, row, after)
         self._differentiate(model, clear, found, self._width(near))
         if near is None:
-            return
+            return end
         matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
         if events is not None:
             rest -= events.moves @ events.rows
@@ -262,6 +332,7 @@ class _Linearisation:
             matrix[:, :nv] = matrix[:, :nv] @ rest
         if events is not None:
             matrix[:, :nv] += spanned @ events.rows
+        return end
 
     def _visibly(
         self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray, near: Near
@@ -331,14 +402,14 @@ class _Linearisation:
     ) -> None:
         """Write differences of this width by all that is wanted."""
         nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        by_control = found.get("ctrl", np.zeros((len(found["state"]), nu)))
+        by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), nu))
         if is_refused:  # by MuJoCo's own function
             self._by_columns(model, row, found, width)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
             mujoco.mjd_transitionFD(model, self.data, width, True, found["state"], by_control, *sensors)
-        for name in found.keys() - {"state", "C", "D"} - ({"ctrl"} if not is_refused else set()):
+        for name in found.keys() - {"state", "C", "D", "end"} - ({"ctrl"} if not is_refused else set()):
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
                 continue

@@ -12,8 +12,17 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 from mjxgrad._arrays import instance, known, one_key
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
-from mjxgrad.planning.linear_model import Analytic, LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
+from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
+from mjxgrad.planning.system import (
+    ControlVector,
+    Cost,
+    Law,
+    Quadratic,
+    StateVector,
+    System,
+    stage_model,
+    terminal_model,
+)
 from mjxgrad.rollouts.arguments import sequence_of
 
 _Row = Float[Array, "*iterations"]
@@ -140,22 +149,12 @@ class Problem(eqx.Module):
         least = jnp.asarray(_LEAST_REGULARISATION, start.dtype)
         return Search(given, given, least, jnp.zeros(self.system.num_changes, bool))
 
-    def run(self, smoother: Smoother | None, course: Course, law: Feedback, step: ArrayLike) -> Course:
+    def run(self, smoother: Smoother, course: Course, law: Feedback, step: ArrayLike) -> Course:
         """Follow a course under a feedback law; a step of zero repeats its controls."""
         follows = jnp.asarray(step) > 0
-
-        def advance(state, inputs):
-            nominal, control, change, gain, key = inputs
-            away = self.system.difference(state, nominal)
-            moved = control + step * change + jnp.where(follows, gain @ away, 0.0)
-            control = jnp.clip(jnp.where(follows, moved, control), self.lower, self.upper)
-            if smoother is None:
-                return self.system.step(state, control), (state, control)
-            return smoother.step(self.system, state, control, key), (state, control)
-
-        inputs = (course.states[:-1], course.controls, law.change, law.gain, self.keys)
-        final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
-        states = jnp.concatenate([states, final[None]])
+        given = jnp.where(follows, course.controls + step * law.change, course.controls)
+        full = Law(course.states[:-1], given, law.gain, follows, self.lower, self.upper)
+        states, controls = smoother.follow(self.system, full, self.keys)
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
@@ -284,7 +283,7 @@ def iterate(
     index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
     course = jax.tree.map(lambda x: x[index], tried)
     is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None
-    true = course if is_exact else problem.run(None, course, law, 0.0)
+    true = course if is_exact else problem.run(Exact(), course, law, 0.0)
     is_better = is_first | (true.cost < search.best.cost)
     best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
     # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
