@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import Engine, engine_of
+from mjxgrad.native.engine import Differences, Engine, engine_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -56,7 +56,7 @@ def roll_out(
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs)
+        jacobians = _jacobians(engine, Differences(gradient, tuple(given)), numbers, before, inputs)
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():
             is_by_step = name in by_input
@@ -92,40 +92,25 @@ def steer(
     return jnp.concatenate([first[None], found["states"]]), found["controls"]
 
 
-def linearise(
-    scene: Scene,
-    start: _Arrays,
-    inputs: _Arrays,
-    gradient: Gradient,
-    wanted: tuple[str, ...] = ("ctrl", "C", "D"),
-    num_substeps: int = 1,
-) -> dict[str, Array]:
-    """Return the Jacobians of one step by "state", "ctrl" and what else is wanted, see `Engine.linearise` and `roll_out`."""
-    before, numbers = {name: x[None] for name, x in start.items()}, changed_numbers(scene)
-    found = _jacobians(engine_of(scene.mj_model), gradient, wanted, numbers, before, inputs, num_substeps)
+def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, how: Differences) -> dict[str, Array]:
+    """Return the Jacobians of one step by "state" and by all that is wanted; inputs have one row, see `roll_out`."""
+    before = {name: x[None] for name, x in start.items()}
+    found = _jacobians(engine_of(scene.mj_model), how, changed_numbers(scene), before, inputs)
     return {name: value[0] for name, value in found.items()}
 
 
 def _jacobians(
-    engine: Engine,
-    gradient: Gradient,
-    wanted: tuple[str, ...],
-    numbers: _Arrays,
-    before: _Arrays,
-    inputs: _Arrays,
-    num_substeps: int = 1,
+    engine: Engine, how: Differences, numbers: _Arrays, before: _Arrays, inputs: _Arrays
 ) -> dict[str, Array]:
     """Return what `Engine.linearise` gives of states before each step; it has no derivative of its own."""
     horizon, dtype = len(inputs["ctrl"]), before["qpos"].dtype
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
-    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(wanted, sizes).items()}
+    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(how.wanted, sizes).items()}
     shapes = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
 
     @jax.custom_jvp
     def call(numbers, before, inputs):
-        return _callback(
-            functools.partial(engine.linearise, gradient, wanted, num_substeps), shapes, numbers, before, inputs
-        )
+        return _callback(functools.partial(engine.linearise, how), shapes, numbers, before, inputs)
 
     @call.defjvp
     def _refuse(primals, tangents):

@@ -41,6 +41,23 @@ def engine_of(mj_model: mujoco.MjModel) -> "Engine":
     return Engine(mj_model)
 
 
+@dataclasses.dataclass(frozen=True)
+class Differences:
+    """How Jacobians of a step are taken.
+
+    Attributes:
+        gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `native.events`.
+        wanted: names of inputs and of the model's numbers, "C" and "D" of the sensors, or "end".
+        num_substeps: MuJoCo's steps in one step, under the same input; without sensors.
+        is_centred: whether differences by state and control are to both sides where no surface is near.
+    """
+
+    gradient: Gradient
+    wanted: tuple[str, ...] = ()
+    num_substeps: int = 1
+    is_centred: bool = True
+
+
 class Engine:
     """A pool of threads for one C model. Arrays have the batch's axes in front, of length one where they are shared."""
 
@@ -118,19 +135,10 @@ class Engine:
             self._share(work, len(models))
         return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
 
-    def linearise(
-        self,
-        gradient: Gradient,
-        wanted: tuple[str, ...],
-        num_substeps: int,
-        numbers: _Arrays,
-        start: _Arrays,
-        inputs: _Arrays,
-    ) -> dict[str, np.ndarray]:
-        """Return the Jacobians of single steps in tangent space, by "state" and by each input and number that is wanted.
+    def linearise(self, how: Differences, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
+        """Return the Jacobians of single steps in tangent space, by "state" and by all that is wanted.
 
-        Those of the sensors, "C" and "D", are of small differences with either gradient. A step may be several of MuJoCo's
-        under the same input; "end" is the state after it, not finite where there is none.
+        Those of the sensors, "C" and "D", are of small differences with either gradient. "end" is the state after a step.
 
         States before each step are in `start`, with an axis of steps as inputs have it.
         """
@@ -140,12 +148,12 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            shapes = self.shapes(wanted, sizes).items()
+            shapes, num_substeps = self.shapes(how.wanted, sizes).items(), how.num_substeps
             found = {
                 k: np.full((num_substeps, len(rows), *shape), np.nan if k == "end" else 0.0) for k, shape in shapes
             }
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
-            self._share(lambda one, piece: one.fill(gradient, models, speeds, rows, piece, found), len(rows))
+            self._share(lambda one, piece: one.fill(how, models, speeds, rows, piece, found), len(rows))
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
         for t in range(1, num_substeps):
             for name in total.keys() - {"end", "state"}:
@@ -174,7 +182,7 @@ class Engine:
             speeds = self._reached(start["qvel"], num_steps)
 
             def work(one: _Worker, piece: range) -> None:
-                one.begin(gradient)
+                one.begin(Differences(gradient))
                 for i in piece:
                     one.use(models, i, speeds)
                     course = ({k: v[i] for k, v in inputs.items()}, changes[0][i], changes[1][i])
@@ -246,10 +254,10 @@ class _Worker:
 
     @np.errstate(invalid="ignore", over="ignore")
     def fill(
-        self, gradient: Gradient, models: list, speeds: np.ndarray, rows: np.ndarray, index: range, found: dict
+        self, how: Differences, models: list, speeds: np.ndarray, rows: np.ndarray, index: range, found: dict
     ) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
-        self.begin(gradient)
+        self.begin(how)
         for i in index:
             self.use(models, i // (len(rows) // len(models)), speeds)
             after = rows[i]
@@ -259,9 +267,9 @@ class _Worker:
                         self.models[1], after.copy(), {name: value[t, i] for name, value in found.items()}
                     )
 
-    def begin(self, gradient: Gradient) -> None:
-        """Take a gradient for what follows."""
-        self.gradient, self.near_to = gradient, None
+    def begin(self, how: Differences) -> None:
+        """Take a way of differentiation for what follows."""
+        self.how, self.near_to = how, None
 
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
@@ -270,7 +278,7 @@ class _Worker:
             model = copy.deepcopy(given)
             model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
             self.models = (given, model)
-        if self.gradient == "slope" and given is not self.near_to:
+        if self.how.gradient == "slope" and given is not self.near_to:
             alike, model = [k for k, one in enumerate(models) if one is given], self.models[1]
             self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
             self.near_to, self.far = given, mujoco.MjData(self.surfaces.model)
@@ -361,7 +369,7 @@ class _Worker:
     ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
         """Return the model to take differences of, what is near, D, and the state about which differences cross no surface."""
         near, nothing = None, np.zeros((0, 0))
-        if self.gradient == "slope" and np.isfinite(after).all():
+        if self.how.gradient == "slope" and np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
             near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
         if near is not None and near.is_undecided:
@@ -408,7 +416,7 @@ class _Worker:
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
-            mujoco.mjd_transitionFD(model, self.data, width, True, found["state"], by_control, *sensors)
+            mujoco.mjd_transitionFD(model, self.data, width, self.how.is_centred, found["state"], by_control, *sensors)
         for name in found.keys() - {"state", "C", "D", "end"} - ({"ctrl"} if not is_refused else set()):
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
