@@ -83,8 +83,8 @@ def roll_out(
 def steer(
     scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int
 ) -> tuple[Float[Array, "horizon+1 state"], Float[Array, "horizon nu"]]:
-    """Return states and controls of a feedback law in one call, see `Engine.steer`; resting inputs belong to the start."""
-    engine, first = engine_of(scene.mj_model), jnp.concatenate([start[name] for name in ("qpos", "qvel", "act")])
+    """Return states and controls of a feedback law in one call, see `Engine.steer`."""
+    engine, first = engine_of(scene.mj_model), law["states"][0]
     shapes = {"states": (len(law["controls"]), first.size), "controls": law["controls"].shape}
     shapes = {name: jax.ShapeDtypeStruct(shape, first.dtype) for name, shape in shapes.items()}
     function = functools.partial(engine.steer, num_substeps, first.dtype)

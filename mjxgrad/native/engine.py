@@ -75,6 +75,7 @@ class Engine:
         self.places = {
             name: slice(begins[name], begins[name] + mujoco.mj_stateSize(mj_model, bit)) for name, bit in bits.items()
         }
+        self.motion = slice(self.places["qpos"].start, self.places["act"].stop)
         self.workers = [_Worker(self) for _ in range(_NUM_THREADS)]
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
@@ -98,39 +99,37 @@ class Engine:
     ) -> dict[str, np.ndarray]:
         """Return the states after each step of a feedback law, which holds a control for some time steps, and the controls.
 
-        The law has the fields of `planning.Law`. Controls are rounded to a type, so that their rollout is the same motion.
+        The law has the fields of `planning.Law`, the start the time and inputs. Controls are rounded to a type, so that their
+        rollout is the same motion.
         """
         with self.lock, collected():
             batch, models, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
             nq, nv, rows = self.mj_model.nq, self.mj_model.nv, self._rows(start)
-            motion = rows[:, self.places["qpos"].start : self.places["act"].stop]
+            motion = rows[:, self.motion]
+            motion[:] = law["states"][:, 0]
             found = {"states": np.zeros((*law["controls"].shape[:2], motion.shape[1]))}
             found["controls"] = np.zeros(law["controls"].shape, dtype)
 
             @np.errstate(invalid="ignore", over="ignore")
             def work(one: _Worker, piece: range) -> None:
                 part = slice(piece.start, piece.stop)
-                given, now, own, row = {k: v[part] for k, v in law.items()}, motion[part], models[part], rows[part]
-                away, ctrl, follows = (
-                    np.zeros((len(piece), given["gain"].shape[3])),
-                    row[:, self.places["ctrl"]],
-                    given["follows"][:, None],
-                )
-                for t in range(given["controls"].shape[1]):
-                    nominal = given["states"][:, t]
-                    for change, start, end in zip(away[:, :nv], nominal[:, :nq], now[:, :nq], strict=True):
-                        mujoco.mj_differentiatePos(self.mj_model, change, 1.0, start, end)
+                follows, lower, upper = (law[name][part] for name in ("follows", "lower", "upper"))
+                row, now, own = rows[part], motion[part], models[part]
+                away, ctrl = np.zeros((len(piece), law["gain"].shape[3])), row[:, self.places["ctrl"]]
+                changes, positions = list(away[:, :nv]), list(now[:, :nq])
+                columns = (*(law[name] for name in ("states", "controls", "gain")), *found.values())
+                for nominal, control, gain, end, chosen in zip(*(x[part].swapaxes(0, 1) for x in columns), strict=True):
+                    for change, start, position in zip(changes, nominal[:, :nq], positions, strict=True):
+                        mujoco.mj_differentiatePos(self.mj_model, change, 1.0, start, position)
                     np.subtract(now[:, nq:], nominal[:, nq:], out=away[:, nv:])
-                    corrected = np.where(follows, (given["gain"][:, t] @ away[:, :, None])[..., 0], 0.0)
-                    corrected += given["controls"][:, t]
-                    chosen = found["controls"][part, t]
-                    np.minimum(np.maximum(corrected, given["lower"]), given["upper"], out=chosen)
+                    corrected = control + np.where(follows[:, None], (gain @ away[..., None])[..., 0], 0.0)
+                    np.minimum(np.maximum(corrected, lower), upper, out=chosen)
                     ctrl[:] = chosen
                     for model, state in zip(own, row, strict=True):
                         mujoco.mj_setState(model, one.data, state, _ALL)
                         mujoco.mj_step(model, one.data, num_substeps)
                         mujoco.mj_getState(model, one.data, state, _ALL)
-                    found["states"][part, t] = now
+                    end[:] = now
 
             self._share(work, len(models))
         return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
@@ -258,18 +257,19 @@ class _Worker:
     ) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
         self.begin(how)
+        num_steps, is_finite = len(rows) // len(models), np.isfinite(rows).all(axis=1).tolist()
         for i in index:
-            self.use(models, i // (len(rows) // len(models)), speeds)
-            after = rows[i]
-            for t in range(len(found["state"])):
-                if np.isfinite(after).all():
-                    after = self._one(
-                        self.models[1], after.copy(), {name: value[t, i] for name, value in found.items()}
-                    )
+            self.use(models, i // num_steps, speeds)
+            row = rows[i].copy() if is_finite[i] else None
+            for t in range(how.num_substeps):
+                if row is not None:
+                    row = self._one(self.models[1], row, {name: value[t, i] for name, value in found.items()})
 
     def begin(self, how: Differences) -> None:
         """Take a way of differentiation for what follows."""
         self.how, self.near_to = how, None
+        self.is_refused = self.engine.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        self.others = set(how.wanted) - {"C", "D", "end"} - ({"ctrl"} if not self.is_refused else set())
 
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
@@ -315,16 +315,18 @@ class _Worker:
                 found[name][t] = value
             found["change"][t] = change
 
-    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray:
-        """Write the Jacobians of a step, and return the state after it."""
-        end, after = np.empty_like(row), self._step(model, row)[1]
+    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray | None:
+        """Write the Jacobians of a step, and return the state after it where that is finite."""
+        end = np.empty_like(row)
+        mujoco.mj_setState(model, self.data, row, _ALL)
+        mujoco.mj_step(model, self.data)
         mujoco.mj_getState(model, self.data, end, _ALL)
+        if not np.isfinite(end).all():
+            return None
         if "end" in found:
-            found["end"][:] = end[self.places["qpos"].start :][: len(found["end"])]
-        if not np.isfinite(after).all():
-            return end
-        row[self.places["warmstart"]] = self.data.qacc_warmstart
-        model, near, spanned, clear = self._near(model, row, after)
+            found["end"][:] = end[self.engine.motion]
+        row[self.places["warmstart"]] = end[self.places["warmstart"]]
+        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]])
         self._differentiate(model, clear, found, self._width(near))
         if near is None:
             return end
@@ -409,15 +411,14 @@ class _Worker:
         self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float
     ) -> None:
         """Write differences of this width by all that is wanted."""
-        nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), nu))
-        if is_refused:  # by MuJoCo's own function
+        by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), model.nu))
+        if self.is_refused:  # by MuJoCo's own function
             self._by_columns(model, row, found, width)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
             mujoco.mjd_transitionFD(model, self.data, width, self.how.is_centred, found["state"], by_control, *sensors)
-        for name in found.keys() - {"state", "C", "D", "end"} - ({"ctrl"} if not is_refused else set()):
+        for name in self.others:
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
                 continue

@@ -200,7 +200,7 @@ class SceneSystem(System):
         if native_motion(self.scene, self.contact) is None:
             return super().follow(law)
         begin, resting = arguments_of(self.scene, self._unflattened(law.states[0]))
-        return steer(self.scene, begin | resting, vars(law), self.num_substeps)
+        return steer(self.scene, {"time": begin["time"], **resting}, vars(law), self.num_substeps)
 
     def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, Float[Array, "n both"]]:
         native = native_motion(self.scene, self.contact)
