@@ -82,7 +82,7 @@ def roll_out(
 
 def steer(
     scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int
-) -> tuple[Float[Array, "horizon+1 state"], Float[Array, "horizon nu"]]:
+) -> tuple[Float[Array, "states state"], Float[Array, "horizon nu"]]:
     """Return states and controls of a feedback law in one call, see `Engine.steer`."""
     engine, first = engine_of(scene.mj_model), law["states"][0]
     shapes = {"states": (len(law["controls"]), first.size), "controls": law["controls"].shape}

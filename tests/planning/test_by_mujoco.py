@@ -1,0 +1,128 @@
+"""Plans by C MuJoCo: the motion is its own, and an iteration asks it twice."""
+
+import collections
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.native.engine import Engine
+from mjxgrad.planning import Controller, GoalCost, SceneSystem, System
+from mjxgrad.planning.system import Law
+
+# A box with an arm, which slides on the floor and turns.
+BOX = """<mujoco><option timestep=".01"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .1"><freejoint name="box"/>
+  <geom type="box" size=".1 .15 .1"/><body pos="0 0 .1"><joint name="arm" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .3" size=".03"/></body></body></worldbody>
+  <actuator><motor joint="box" gear="40 10 0 0 0 20"/><motor joint="arm" ctrlrange="-1 1"/></actuator></mujoco>"""
+HORIZON = 6
+
+
+class StepByStep(SceneSystem):
+    """The same system by its step alone."""
+
+    follow = System.follow
+    linearised = System.linearised
+
+
+@pytest.fixture(params=["double", "single"])
+def error(request):
+    """The tolerance: what the solves leave, from another warm start, or roundings of single precision."""
+    with jax.enable_x64(request.param == "double"):
+        yield 1e-6 if request.param == "double" else 2e-4
+
+
+def system_by(kind=SceneSystem):
+    return kind(scene=mg.load_scene(BOX), num_substeps=2, contact=mg.Discrete("mujoco"))
+
+
+def start_of(system):
+    """Turned, and in motion."""
+    change = np.random.default_rng(3).normal(size=system.num_changes)
+    change[2:5] = 0.0  # flat on the floor
+    return system.retract(system.origin, jnp.asarray(0.2 * change, system.origin.dtype))
+
+
+def controller_of(system):
+    goal = system.retract(system.origin, 0.3 * jnp.ones(system.num_changes).at[2:5].set(0.0))
+    return Controller(system, GoalCost(goal, 1.0, 10.0, 0.01), jnp.zeros((HORIZON, 2)), schedule=[1.0, 1.0])
+
+
+def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(error):
+    system = system_by()
+    scene, nq, start, controller = system.scene, system.scene.model.nq, start_of(system), controller_of(system)
+    for _ in range(2):
+        controller(np.asarray(start))
+    begin = mg.initial_state(scene, start[:nq], start[nq:])
+    found = mg.rollout(scene, begin, jnp.repeat(controller.plan.controls, 2, axis=0), contact=mg.Discrete("mujoco"))
+    np.testing.assert_array_equal(controller.plan.states[:, :nq], found.qpos[::2])
+    np.testing.assert_array_equal(controller.plan.states[:, nq:], found.qvel[::2])
+    assert np.abs(controller.plan.controls).min() > 1e-3
+
+
+def test_an_iteration_asks_c_mujoco_twice(monkeypatch):
+    """Once for all linear models, and once for all step lengths; a call for each step would be seen."""
+    counts = collections.Counter()
+    for name in ("run", "steer", "linearise", "follow"):
+        monkeypatch.setattr(Engine, name, _counted(counts, name))
+    controller = controller_of(system_by())
+    state = np.asarray(start_of(controller.system))
+    controller(state)
+    counts.clear()
+    controller(state)
+    assert counts == {"steer": 2, "linearise": 2}
+
+
+def _counted(counts, name):
+    function = getattr(Engine, name)
+
+    def call(*given, **settings):
+        counts[name] += 1
+        return function(*given, **settings)
+
+    return call
+
+
+def test_a_plan_is_that_of_single_steps(error):
+    ours, other = (controller_of(system_by(kind)) for kind in (SceneSystem, StepByStep))
+    for controller in (ours, other):
+        first = controller(np.asarray(start_of(controller.system)))
+        assert np.abs(first).max() > 0.1
+    np.testing.assert_allclose(ours.plan.states, other.plan.states, atol=10 * error)
+    np.testing.assert_allclose(ours.plan.controls, other.plan.controls, atol=100 * error)
+    np.testing.assert_allclose(ours.plan.cost, other.plan.cost, rtol=error)
+
+
+def test_a_law_turns_a_free_body_as_single_steps_do(error):
+    """Around states that it is not at; without gains, under NaN ones, the controls are those given."""
+    system, rng = system_by(), np.random.default_rng(0)
+    start, dtype = start_of(system), system.origin.dtype
+    changes, gain = (rng.normal(size=(HORIZON, *sizes, system.num_changes)) for sizes in ((), (2,)))
+    nominal = jax.vmap(system.retract, (None, 0))(start, jnp.asarray(0.1 * changes, dtype).at[0].set(0.0))
+    controls, limits = jnp.asarray(rng.normal(size=(HORIZON, 2)), dtype), jnp.array([1.5, 1.0])
+
+    def law(follows, factor):
+        return Law(nominal, controls, factor * jnp.asarray(gain, dtype), follows, -limits, limits)
+
+    follows, factors = jnp.array([True, False]), jnp.array([1.0, jnp.nan])
+    (states, chosen), expected = (
+        jax.vmap(lambda *given, one=one: one.follow(law(*given)))(follows, factors)
+        for one in (system, system_by(StepByStep))
+    )
+    np.testing.assert_allclose(states, expected[0], atol=10 * error)
+    np.testing.assert_allclose(chosen, expected[1], atol=10 * error)
+    np.testing.assert_array_equal(chosen[1], np.clip(controls, -limits, limits))
+    assert np.abs(chosen[0] - chosen[1]).max() > 0.1
+    assert (np.abs(chosen) == limits).any()
+
+
+@pytest.mark.parametrize("gradient", [mg.Discrete, mg.Slope])
+def test_linear_models_are_those_of_single_steps(error, gradient):
+    kinds = (SceneSystem, StepByStep)
+    systems = [kind(scene=mg.load_scene(BOX), num_substeps=2, contact=gradient("mujoco")) for kind in kinds]
+    given = (start_of(systems[0]), jnp.array([0.3, -0.2]))
+    (end, jacobian), (other, expected) = (jax.jit(system.linearised)(*given) for system in systems)
+    np.testing.assert_allclose(end, other, atol=error)
+    np.testing.assert_allclose(jacobian, expected, atol=error * np.abs(expected).max())
