@@ -7,6 +7,7 @@ takes a change of the start to the end. JAX transposes that recursion, so forwar
 import functools
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import Differences, Engine, engine_of
+from mjxgrad.native.engine import Engine, engine_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -56,7 +57,7 @@ def roll_out(
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        jacobians = _jacobians(engine, Differences(gradient, tuple(given)), numbers, before, inputs)
+        jacobians = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=tuple(given))
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():
             is_by_step = name in by_input
@@ -85,32 +86,29 @@ def steer(
 ) -> tuple[Float[Array, "states state"], Float[Array, "horizon nu"]]:
     """Return states and controls of a feedback law in one call, see `Engine.steer`."""
     engine, first = engine_of(scene.mj_model), law["states"][0]
-    shapes = {"states": (len(law["controls"]), first.size), "controls": law["controls"].shape}
-    shapes = {name: jax.ShapeDtypeStruct(shape, first.dtype) for name, shape in shapes.items()}
+    shapes = {name: jax.ShapeDtypeStruct(law[name].shape, first.dtype) for name in ("states", "controls")}
     function = functools.partial(engine.steer, num_substeps, first.dtype)
     found = _callback(function, shapes, changed_numbers(scene), start, law)
     return jnp.concatenate([first[None], found["states"]]), found["controls"]
 
 
-def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, how: Differences) -> dict[str, Array]:
-    """Return the Jacobians of one step by "state" and by all that is wanted; inputs have one row, see `roll_out`."""
+def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, **how: Any) -> dict[str, Array]:
+    """Return the Jacobians of one step by "state" and all that is wanted, see `Engine.linearise`."""
     before = {name: x[None] for name, x in start.items()}
-    found = _jacobians(engine_of(scene.mj_model), how, changed_numbers(scene), before, inputs)
+    found = _jacobians(engine_of(scene.mj_model), changed_numbers(scene), before, inputs, **how)
     return {name: value[0] for name, value in found.items()}
 
 
-def _jacobians(
-    engine: Engine, how: Differences, numbers: _Arrays, before: _Arrays, inputs: _Arrays
-) -> dict[str, Array]:
+def _jacobians(engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, **how: Any) -> dict[str, Array]:
     """Return what `Engine.linearise` gives of states before each step; it has no derivative of its own."""
     horizon, dtype = len(inputs["ctrl"]), before["qpos"].dtype
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
-    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(how.wanted, sizes).items()}
+    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(how["wanted"], sizes).items()}
     shapes = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
 
     @jax.custom_jvp
     def call(numbers, before, inputs):
-        return _callback(functools.partial(engine.linearise, how), shapes, numbers, before, inputs)
+        return _callback(functools.partial(engine.linearise, **how), shapes, numbers, before, inputs)
 
     @call.defjvp
     def _refuse(primals, tangents):

@@ -24,7 +24,6 @@ INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "moc
 START = ("time", "qpos", "qvel", "act")
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
-_MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE_ACT.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
@@ -39,23 +38,6 @@ _Arrays = Mapping[str, np.ndarray]
 def engine_of(mj_model: mujoco.MjModel) -> "Engine":
     """Return the engine of a C model; threads and memory are kept, and programs that call it are compiled once."""
     return Engine(mj_model)
-
-
-@dataclasses.dataclass(frozen=True)
-class Differences:
-    """How Jacobians of a step are taken.
-
-    Attributes:
-        gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `native.events`.
-        wanted: names of inputs and of the model's numbers, "C" and "D" of the sensors, or "end".
-        num_substeps: MuJoCo's steps in one step, under the same input; without sensors.
-        is_centred: whether differences by state and control are to both sides where no surface is near.
-    """
-
-    gradient: Gradient
-    wanted: tuple[str, ...] = ()
-    num_substeps: int = 1
-    is_centred: bool = True
 
 
 class Engine:
@@ -134,12 +116,17 @@ class Engine:
             self._share(work, len(models))
         return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
 
-    def linearise(self, how: Differences, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
-        """Return the Jacobians of single steps in tangent space, by "state" and by all that is wanted.
+    def linearise(
+        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *,
+        gradient: Gradient, wanted: tuple[str, ...], num_substeps: int = 1, is_centred: bool = True,
+    ) -> dict[str, np.ndarray]:  # fmt: skip
+        """Return the Jacobians of single steps in tangent space, by "state" and by each input and number that is wanted.
 
-        Those of the sensors, "C" and "D", are of small differences with either gradient. "end" is the state after a step.
+        Those of the sensors, "C" and "D", are of small differences with either gradient.
 
-        States before each step are in `start`, with an axis of steps as inputs have it.
+        States before each step are in `start`, with an axis of steps as inputs have it. A step may be several of MuJoCo's
+        under one input; "end" is the state after it, NaN if it is not finite. Differences where no surface is near may be
+        to one side.
         """
         with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 2, numbers, start, inputs)
@@ -147,17 +134,19 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            shapes, num_substeps = self.shapes(how.wanted, sizes).items(), how.num_substeps
-            found = {
-                k: np.full((num_substeps, len(rows), *shape), np.nan if k == "end" else 0.0) for k, shape in shapes
-            }
+            shapes, size = self.shapes(wanted, sizes).items(), (num_substeps, len(rows))
+            found = {k: np.full((*size, *shape), np.nan if k == "end" else 0.0) for k, shape in shapes}
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
-            self._share(lambda one, piece: one.fill(how, models, speeds, rows, piece, found), len(rows))
+
+            def work(one: _Worker, piece: range) -> None:
+                one.begin(gradient, is_centred)
+                one.fill(models, speeds, rows, piece, found)
+
+            self._share(work, len(rows))
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
-        for t in range(1, num_substeps):
-            for name in total.keys() - {"end", "state"}:
-                total[name] = found["state"][t] @ total[name] + found[name][t]
-            total["state"] = found["state"][t] @ total["state"]
+        for t, matrix in enumerate(found["state"][1:], 1):
+            own = {name: found[name][t] for name in wanted if name != "end"} | {"state": 0.0}
+            total |= {name: matrix @ total[name] + value for name, value in own.items()}
         return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in total.items()}
 
     def follow(
@@ -181,7 +170,7 @@ class Engine:
             speeds = self._reached(start["qvel"], num_steps)
 
             def work(one: _Worker, piece: range) -> None:
-                one.begin(Differences(gradient))
+                one.begin(gradient)
                 for i in piece:
                     one.use(models, i, speeds)
                     course = ({k: v[i] for k, v in inputs.items()}, changes[0][i], changes[1][i])
@@ -252,24 +241,19 @@ class _Worker:
         self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
 
     @np.errstate(invalid="ignore", over="ignore")
-    def fill(
-        self, how: Differences, models: list, speeds: np.ndarray, rows: np.ndarray, index: range, found: dict
-    ) -> None:
+    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: range, found: dict) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
-        self.begin(how)
         num_steps, is_finite = len(rows) // len(models), np.isfinite(rows).all(axis=1).tolist()
         for i in index:
             self.use(models, i // num_steps, speeds)
             row = rows[i].copy() if is_finite[i] else None
-            for t in range(how.num_substeps):
+            for t in range(len(found["state"])):
                 if row is not None:
                     row = self._one(self.models[1], row, {name: value[t, i] for name, value in found.items()})
 
-    def begin(self, how: Differences) -> None:
-        """Take a way of differentiation for what follows."""
-        self.how, self.near_to = how, None
-        self.is_refused = self.engine.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        self.others = set(how.wanted) - {"C", "D", "end"} - ({"ctrl"} if not self.is_refused else set())
+    def begin(self, gradient: Gradient, is_centred: bool = True) -> None:
+        """Take a gradient for what follows."""
+        self.gradient, self.is_centred, self.near_to = gradient, is_centred, None
 
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
@@ -278,7 +262,7 @@ class _Worker:
             model = copy.deepcopy(given)
             model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
             self.models = (given, model)
-        if self.how.gradient == "slope" and given is not self.near_to:
+        if self.gradient == "slope" and given is not self.near_to:
             alike, model = [k for k, one in enumerate(models) if one is given], self.models[1]
             self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
             self.near_to, self.far = given, mujoco.MjData(self.surfaces.model)
@@ -327,7 +311,7 @@ class _Worker:
             found["end"][:] = end[self.engine.motion]
         row[self.places["warmstart"]] = end[self.places["warmstart"]]
         model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]])
-        self._differentiate(model, clear, found, self._width(near))
+        self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
         if near is None:
             return end
         matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
@@ -371,7 +355,7 @@ class _Worker:
     ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
         """Return the model to take differences of, what is near, D, and the state about which differences cross no surface."""
         near, nothing = None, np.zeros((0, 0))
-        if self.how.gradient == "slope" and np.isfinite(after).all():
+        if self.gradient == "slope" and np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
             near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
         if near is not None and near.is_undecided:
@@ -408,17 +392,18 @@ class _Worker:
         return np.array(columns).T
 
     def _differentiate(
-        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float
+        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, is_centred: bool
     ) -> None:
         """Write differences of this width by all that is wanted."""
-        by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), model.nu))
-        if self.is_refused:  # by MuJoCo's own function
+        nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), nu))
+        if is_refused:  # by MuJoCo's own function
             self._by_columns(model, row, found, width)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
-            mujoco.mjd_transitionFD(model, self.data, width, self.how.is_centred, found["state"], by_control, *sensors)
-        for name in self.others:
+            mujoco.mjd_transitionFD(model, self.data, width, is_centred, found["state"], by_control, *sensors)
+        for name in found.keys() - {"state", "C", "D", "end"} - ({"ctrl"} if not is_refused else set()):
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
                 continue

@@ -29,11 +29,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
-from mjxgrad.planning.system import ChangeVector, ControlVector, Law, Motion, SceneSystem, StateVector, System
+from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
 from mjxgrad.stepping import Smoothing
 
 _Samples = Float[Array, "N both"]
@@ -60,9 +60,9 @@ class Smoother(eqx.Module):
     def step(self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray) -> StateVector:
         """Return the next state of the smoothed system."""
 
-    def follow(self, system: System, law: Law, keys: Key[Array, " horizon"]) -> Motion:
-        """Return the states and controls of the smoothed system under a feedback law; a key for each step is consumed."""
-        return law.follow(system, lambda *at: self.step(system, *at), keys)
+    def native(self, system: System) -> SceneSystem | None:
+        """Return the system to be stepped if C MuJoCo steps it, without samples."""
+        return None
 
     @abstractmethod
     def linear_model(
@@ -91,13 +91,19 @@ class Analytic(Smoother):
     def step(self, system, state, control, key):
         return self._smoothed(system).step(state, control)
 
-    def follow(self, system, law, keys):
-        return self._smoothed(system).follow(law)
-
     def linear_model(self, system, state, control, key):
-        end, jacobian = self._smoothed(system).linearised(state, control)
-        change = jnp.zeros(system.num_changes, state.dtype)
-        return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(end)))
+        native, system = self.native(system), self._smoothed(system)
+        if native is not None:
+            end, jacobian = native.linearised(state, control)
+            change = system.difference(end, end)  # not finite where the end is not
+        else:
+            noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
+            end, (change,), (jacobian,) = _linearised(system, state, control, noise)
+        return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
+
+    def native(self, system):
+        system = self._smoothed(system)
+        return system if isinstance(system, SceneSystem) and system.native else None
 
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)
@@ -218,11 +224,16 @@ class Sampled(Smoother):
         return stddev, jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)
 
 
+def _perturbed(system: System, state: StateVector, control: ControlVector, noise: Float[Array, " both"]) -> StateVector:
+    n = system.num_changes
+    return system.step(system.retract(state, noise[:n]), control + noise[n:])
+
+
 def _sampled(
     system: System, state: StateVector, control: ControlVector, noise: _Samples
 ) -> tuple[StateVector, Float[Array, "N n"]]:
     """Return the next state without noise, and the changes from it to the next states with noise."""
-    ends = jax.vmap(lambda w: system.perturbed(state, control, w))(jnp.pad(noise, ((1, 0), (0, 0))))
+    ends = jax.vmap(lambda w: _perturbed(system, state, control, w))(jnp.pad(noise, ((1, 0), (0, 0))))
     return ends[0], jax.vmap(lambda end: system.difference(end, ends[0]))(ends[1:])
 
 
@@ -233,7 +244,7 @@ def _linearised(
 
     def sample(noise):
         def moved(change):
-            end = system.perturbed(state, control, noise + change)
+            end = _perturbed(system, state, control, noise + change)
             return end, end
 
         return jax.jacfwd(moved, has_aux=True)(jnp.zeros_like(noise))

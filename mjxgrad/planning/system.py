@@ -11,57 +11,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native import Differences, linearise, roll_out, steer
+from mjxgrad.native import linearise, roll_out, steer
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 from mjxgrad.rollouts.arguments import arguments_of, native_motion
 from mjxgrad.rollouts.state import check_scene, data_of, state_of
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Discrete, check_contact, step
+from mjxgrad.stepping import Contact, Discrete, OwnMotion, check_contact, step
 
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]
 ChangeVector = Float[Array, " n"]
-Motion = tuple[Float[Array, "states state"], Float[Array, "horizon m"]]
-
-
-class Law(eqx.Module):
-    """A linear feedback law: controls that a gain corrects by the distance from nominal states, within limits.
-
-    Attributes:
-        states: nominal states; the first one is the start.
-        controls: controls at the nominal states.
-        gain: derivative of the control by the change of the state.
-        follows: whether the gain acts; otherwise the states have no effect.
-        lower: lower limits of the controls.
-        upper: upper limits of the controls.
-    """
-
-    states: Float[Array, "horizon state"]
-    controls: Float[Array, "horizon m"]
-    gain: Float[Array, "horizon m n"]
-    follows: Bool[Array, ""]
-    lower: ControlVector
-    upper: ControlVector
-
-    def follow(self, system: "System", step: Callable[..., StateVector], *inputs: Array) -> Motion:
-        """Return the states and controls of a step, which also takes a row of each input."""
-
-        def advance(state, row):
-            nominal, control, gain, *given = row
-            away = system.difference(state, nominal)
-            control = jnp.clip(control + jnp.where(self.follows, gain @ away, 0.0), self.lower, self.upper)
-            return step(state, control, *given), (state, control)
-
-        rows = (self.states, self.controls, self.gain, *inputs)
-        final, (states, controls) = jax.lax.scan(advance, self.states[0], rows)
-        return jnp.concatenate([states, final[None]]), controls
 
 
 class System(eqx.Module):
@@ -83,26 +49,6 @@ class System(eqx.Module):
     @abstractmethod
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
         """Return the next state."""
-
-    def follow(self, law: Law) -> Motion:
-        """Return the states and controls under a feedback law."""
-        return law.follow(self, self.step)
-
-    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, Float[Array, "n both"]]:
-        """Return the next state, and the derivative of its change by the change of the state, then by the control."""
-
-        def moved(change):
-            end = self.perturbed(state, control, change)
-            return end, end
-
-        zeros = jnp.zeros(self.num_changes + self.num_controls, state.dtype)
-        jacobian, end = jax.jacfwd(moved, has_aux=True)(zeros)
-        return end, jax.jacfwd(self.difference)(end, end) @ jacobian
-
-    def perturbed(self, state: StateVector, control: ControlVector, change: Float[Array, " both"]) -> StateVector:
-        """Return the next state after a change of the state, then of the control."""
-        n = self.num_changes
-        return self.step(self.retract(state, change[:n]), control + change[n:])
 
     def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         """Return the state moved by a change."""
@@ -191,28 +137,29 @@ class SceneSystem(System):
         """Return the qpos of states."""
         return state[..., : self.scene.model.nq]
 
+    @property
+    def native(self) -> OwnMotion | None:
+        """How C MuJoCo steps the scene; None where MJX does."""
+        return native_motion(self.scene, self.contact)
+
+    def steer(self, **law: Array) -> tuple[Float[Array, "states state"], Float[Array, "horizon m"]]:
+        """Return C MuJoCo's states and controls under a feedback law, see `native.engine.Engine.steer`."""
+        begin, resting = arguments_of(self.scene, self._unflattened(law["states"][0]))
+        return steer(self.scene, {"time": begin["time"], **resting}, law, self.num_substeps)
+
+    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, Float[Array, "n both"]]:
+        """Return C MuJoCo's next state, and its derivative by state and control."""
+        begin, resting = arguments_of(self.scene, self._unflattened(state))
+        inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
+        # Differences to one side are off by a few roundings of single precision, and take half as long.
+        how = {"num_substeps": self.num_substeps, "is_centred": state.dtype != jnp.float32}
+        found = linearise(self.scene, begin, inputs, gradient=self.native.gradient, wanted=("ctrl", "end"), **how)
+        return found["end"], jnp.concatenate([found["state"], found["ctrl"]], axis=1)
+
     def _unflattened(self, state: StateVector) -> State:
         nq, nv = self.scene.model.nq, self.scene.model.nv
         qvel = state[nq : nq + nv]
         return State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
-
-    def follow(self, law: Law) -> Motion:
-        if native_motion(self.scene, self.contact) is None:
-            return super().follow(law)
-        begin, resting = arguments_of(self.scene, self._unflattened(law.states[0]))
-        return steer(self.scene, {"time": begin["time"], **resting}, vars(law), self.num_substeps)
-
-    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, Float[Array, "n both"]]:
-        native = native_motion(self.scene, self.contact)
-        if native is None:
-            return super().linearised(state, control)
-        begin, resting = arguments_of(self.scene, self._unflattened(state))
-        inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
-        # Differences to one side are off by a few roundings of single precision, and take half as long.
-        is_centred = state.dtype != jnp.float32
-        how = Differences(native.gradient, ("ctrl", "end"), self.num_substeps, is_centred)
-        found = linearise(self.scene, begin, inputs, how)
-        return found["end"], jnp.concatenate([found["state"], found["ctrl"]], axis=1)
 
     @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:

@@ -13,16 +13,7 @@ from mjxgrad._arrays import instance, known, one_key
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
-from mjxgrad.planning.system import (
-    ControlVector,
-    Cost,
-    Law,
-    Quadratic,
-    StateVector,
-    System,
-    stage_model,
-    terminal_model,
-)
+from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 from mjxgrad.rollouts.arguments import sequence_of
 
 _Row = Float[Array, "*iterations"]
@@ -151,9 +142,22 @@ class Problem(eqx.Module):
     def run(self, smoother: Smoother, course: Course, law: Feedback, step: ArrayLike) -> Course:
         """Follow a course under a feedback law; a step of zero repeats its controls."""
         follows = jnp.asarray(step) > 0
-        given = jnp.where(follows, course.controls + step * law.change, course.controls)
-        full = Law(course.states[:-1], given, law.gain, follows, self.lower, self.upper)
-        states, controls = smoother.follow(self.system, full, self.keys)
+
+        def advance(state, inputs):
+            nominal, control, change, gain, key = inputs
+            away = self.system.difference(state, nominal)
+            moved = control + step * change + jnp.where(follows, gain @ away, 0.0)
+            control = jnp.clip(jnp.where(follows, moved, control), self.lower, self.upper)
+            return smoother.step(self.system, state, control, key), (state, control)
+
+        if (native := smoother.native(self.system)) is not None:
+            given = course.controls + jnp.where(follows, step * law.change, 0.0)
+            full = {"controls": given, "gain": law.gain, "follows": follows, "lower": self.lower, "upper": self.upper}
+            states, controls = native.steer(states=course.states[:-1], **full)
+        else:
+            inputs = (course.states[:-1], course.controls, law.change, law.gain, self.keys)
+            final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
+            states = jnp.concatenate([states, final[None]])
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 

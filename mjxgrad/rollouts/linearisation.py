@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native import Differences
 from mjxgrad.native import linearise as by_mujoco
 from mjxgrad.rollouts.arguments import arguments_of, check_start, native_motion, sequence_of
 from mjxgrad.rollouts.state import State, data_of
@@ -54,7 +53,7 @@ def linearise(
     if native is not None:
         start, resting = arguments_of(scene, state)
         inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
-        found = by_mujoco(scene, start, inputs, Differences(native.gradient, ("ctrl", "C", "D")))
+        found = by_mujoco(scene, start, inputs, gradient=native.gradient, wanted=("ctrl", "C", "D"))
         return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
     end = step(scene.model, data_of(scene, state, ctrl), contact=contact)

@@ -1,6 +1,7 @@
 """Plans by C MuJoCo: the motion is its own, and an iteration asks it twice."""
 
 import collections
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.native.engine import Engine
-from mjxgrad.planning import Controller, GoalCost, SceneSystem, System
-from mjxgrad.planning.system import Law
+from mjxgrad.planning import Controller, Exact, GoalCost, SceneSystem
+from mjxgrad.planning.trajectory import Course, Feedback, Problem
 
 # A box with an arm, which slides on the floor and turns.
 BOX = """<mujoco><option timestep=".01"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .1"><freejoint name="box"/>
@@ -23,8 +24,7 @@ HORIZON = 6
 class StepByStep(SceneSystem):
     """The same system by its step alone."""
 
-    follow = System.follow
-    linearised = System.linearised
+    native = None
 
 
 @pytest.fixture(params=["double", "single"])
@@ -96,26 +96,28 @@ def test_a_plan_is_that_of_single_steps(error):
 
 
 def test_a_law_turns_a_free_body_as_single_steps_do(error):
-    """Around states that it is not at; without gains, under NaN ones, the controls are those given."""
+    """Around states that it is not at; a step of zero repeats the controls, even under gains that are NaN."""
     system, rng = system_by(), np.random.default_rng(0)
     start, dtype = start_of(system), system.origin.dtype
     changes, gain = (rng.normal(size=(HORIZON, *sizes, system.num_changes)) for sizes in ((), (2,)))
     nominal = jax.vmap(system.retract, (None, 0))(start, jnp.asarray(0.1 * changes, dtype).at[0].set(0.0))
-    controls, limits = jnp.asarray(rng.normal(size=(HORIZON, 2)), dtype), jnp.array([1.5, 1.0])
+    controls, change = jnp.asarray(rng.normal(size=(2, HORIZON, 2)), dtype)
+    limits = jnp.array([1.5, 1.0], dtype)
+    course = Course(jnp.concatenate([nominal, nominal[-1:]]), controls, jnp.zeros((), dtype))
+    keys = jax.random.split(jax.random.key(0), HORIZON)
 
-    def law(follows, factor):
-        return Law(nominal, controls, factor * jnp.asarray(gain, dtype), follows, -limits, limits)
+    def run(system, step, factor):
+        problem = Problem(system, GoalCost(start, 1.0, 1.0, 1.0), Exact(), keys, -limits, limits)
+        law = Feedback(change, factor * jnp.asarray(gain, dtype), jnp.zeros((), dtype), jnp.asarray(True))
+        return problem.run(Exact(), course, law, step)
 
-    follows, factors = jnp.array([True, False]), jnp.array([1.0, jnp.nan])
-    (states, chosen), expected = (
-        jax.vmap(lambda *given, one=one: one.follow(law(*given)))(follows, factors)
-        for one in (system, system_by(StepByStep))
-    )
-    np.testing.assert_allclose(states, expected[0], atol=10 * error)
-    np.testing.assert_allclose(chosen, expected[1], atol=10 * error)
-    np.testing.assert_array_equal(chosen[1], np.clip(controls, -limits, limits))
-    assert np.abs(chosen[0] - chosen[1]).max() > 0.1
-    assert (np.abs(chosen) == limits).any()
+    given = (jnp.array([0.5, 0.0], dtype), jnp.array([1.0, jnp.nan], dtype))
+    found, expected = (jax.vmap(functools.partial(run, one))(*given) for one in (system, system_by(StepByStep)))
+    np.testing.assert_allclose(found.states, expected.states, atol=10 * error)
+    np.testing.assert_allclose(found.controls, expected.controls, atol=10 * error)
+    np.testing.assert_array_equal(found.controls[1], np.clip(controls, -limits, limits))
+    assert np.abs(found.controls[0] - found.controls[1]).max() > 0.1
+    assert (np.abs(found.controls[0]) == limits).any()
 
 
 @pytest.mark.parametrize("gradient", [mg.Discrete, mg.Slope])
@@ -123,6 +125,9 @@ def test_linear_models_are_those_of_single_steps(error, gradient):
     kinds = (SceneSystem, StepByStep)
     systems = [kind(scene=mg.load_scene(BOX), num_substeps=2, contact=gradient("mujoco")) for kind in kinds]
     given = (start_of(systems[0]), jnp.array([0.3, -0.2]))
-    (end, jacobian), (other, expected) = (jax.jit(system.linearised)(*given) for system in systems)
-    np.testing.assert_allclose(end, other, atol=error)
-    np.testing.assert_allclose(jacobian, expected, atol=error * np.abs(expected).max())
+    found, expected = (
+        jax.jit(lambda *at, one=system: Exact().linear_model(one, *at, None))(*given) for system in systems
+    )
+    np.testing.assert_allclose(found.c, expected.c, atol=error)
+    for name in ("A", "B"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=error * np.abs(expected.A).max())
