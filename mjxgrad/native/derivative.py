@@ -63,7 +63,8 @@ def roll_out(
             is_by_step = name in by_input
             change = change.reshape(horizon, -1) if is_by_step else change.reshape(-1)
             forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
-        changes = {k: _or_zero(by_start[k]) for k in found}
+        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731
+        changes = {k: zero(by_start[k]) for k in found}
         first = jnp.concatenate([to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
 
         def advance(change: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -81,9 +82,7 @@ def roll_out(
     return found["qpos"], found["qvel"], found["act"]
 
 
-def steer(
-    scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int
-) -> tuple[Float[Array, "states state"], Float[Array, "horizon nu"]]:
+def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tuple[Array, Array]:
     """Return states and controls of a feedback law in one call, see `Engine.steer`."""
     engine, first = engine_of(scene.mj_model), law["states"][0]
     shapes = {name: jax.ShapeDtypeStruct(law[name].shape, first.dtype) for name in ("states", "controls")}
@@ -123,10 +122,6 @@ def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
         return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
 
     return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
-
-
-def _or_zero(tangent) -> Array:
-    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent  # pyright: ignore[reportArgumentType]
 
 
 def to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:

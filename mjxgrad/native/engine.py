@@ -24,6 +24,7 @@ INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "moc
 START = ("time", "qpos", "qvel", "act")
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
+_MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE_ACT.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
@@ -57,7 +58,6 @@ class Engine:
         self.places = {
             name: slice(begins[name], begins[name] + mujoco.mj_stateSize(mj_model, bit)) for name, bit in bits.items()
         }
-        self.motion = slice(self.places["qpos"].start, self.places["act"].stop)
         self.workers = [_Worker(self) for _ in range(_NUM_THREADS)]
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
@@ -65,53 +65,51 @@ class Engine:
         with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
             rows = self._rows(start)
-            full, user = (self._part(rows, spec) for spec in (_FULL, _USER))
+            full = np.zeros((len(rows), mujoco.mj_stateSize(self.mj_model, _FULL)))
+            for row, part in zip(rows, full, strict=True):
+                mujoco.mj_extractState(self.mj_model, row, _ALL, part, _FULL)
+            user = rows[:, self.places["ctrl"].start : self.places["mocap_quat"].stop]
             given = np.repeat(user[:, None], inputs["ctrl"].shape[1], axis=1)
             for name, value in inputs.items():
                 place = self.places[name].start - self.places["ctrl"].start
                 width = math.prod(value.shape[2:])
                 given[..., place : place + width] = value.reshape(*value.shape[:2], width)
             found = self.pool.rollout(models, [one.data for one in self.workers], full, given, control_spec=_USER)[0]
-        ends = np.cumsum([1, self.mj_model.nq, self.mj_model.nv, self.mj_model.na])
-        parts = np.split(np.asarray(found), ends, axis=2)[1:4]
-        return {name: part.reshape(*batch, *part.shape[1:]) for name, part in zip(START[1:], parts, strict=True)}
+        parts = {name: np.asarray(found)[..., self.places[name]] for name in START[1:]}
+        return {name: part.reshape(*batch, *part.shape[1:]) for name, part in parts.items()}
 
     def steer(
         self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
     ) -> dict[str, np.ndarray]:
-        """Return the states after each step of a feedback law, which holds a control for some time steps, and the controls.
+        """Return states and controls under a law: controls that a gain corrects by the distance from nominal states, in limits.
 
-        The law has the fields of `planning.Law`, the start the time and inputs. Controls are rounded to a type, so that their
-        rollout is the same motion.
+        A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
         """
         with self.lock, collected():
             batch, models, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
-            nq, nv, rows = self.mj_model.nq, self.mj_model.nv, self._rows(start)
-            motion = rows[:, self.motion]
-            motion[:] = law["states"][:, 0]
-            found = {"states": np.zeros((*law["controls"].shape[:2], motion.shape[1]))}
-            found["controls"] = np.zeros(law["controls"].shape, dtype)
+            nq, nv = self.mj_model.nq, self.mj_model.nv
+            found = {"states": np.zeros(law["states"].shape), "controls": np.zeros(law["controls"].shape, dtype)}
+            columns = (*(law[name] for name in ("states", "controls", "gain")), *found.values())
+            rows = self._rows(start)
 
             @np.errstate(invalid="ignore", over="ignore")
-            def work(one: _Worker, piece: range) -> None:
-                part = slice(piece.start, piece.stop)
-                follows, lower, upper = (law[name][part] for name in ("follows", "lower", "upper"))
-                row, now, own = rows[part], motion[part], models[part]
-                away, ctrl = np.zeros((len(piece), law["gain"].shape[3])), row[:, self.places["ctrl"]]
-                changes, positions = list(away[:, :nv]), list(now[:, :nq])
-                columns = (*(law[name] for name in ("states", "controls", "gain")), *found.values())
-                for nominal, control, gain, end, chosen in zip(*(x[part].swapaxes(0, 1) for x in columns), strict=True):
-                    for change, start, position in zip(changes, nominal[:, :nq], positions, strict=True):
-                        mujoco.mj_differentiatePos(self.mj_model, change, 1.0, start, position)
-                    np.subtract(now[:, nq:], nominal[:, nq:], out=away[:, nv:])
-                    corrected = control + np.where(follows[:, None], (gain @ away[..., None])[..., 0], 0.0)
-                    np.minimum(np.maximum(corrected, lower), upper, out=chosen)
-                    ctrl[:] = chosen
-                    for model, state in zip(own, row, strict=True):
-                        mujoco.mj_setState(model, one.data, state, _ALL)
-                        mujoco.mj_step(model, one.data, num_substeps)
-                        mujoco.mj_getState(model, one.data, state, _ALL)
-                    end[:] = now
+            def work(one: _Worker, piece: list[int]) -> None:
+                away, ctrl = np.zeros(law["gain"].shape[3]), one.data.ctrl
+                for i in piece:
+                    state = law["states"][i, 0]
+                    follows, lower, upper = (law[name][i] for name in ("follows", "lower", "upper"))
+                    mujoco.mj_setState(models[i], one.data, rows[i], _ALL)
+                    mujoco.mj_setState(models[i], one.data, state, _MOTION)
+                    for nominal, control, gain, end, chosen in zip(*(x[i] for x in columns), strict=True):
+                        if follows:
+                            mujoco.mj_differentiatePos(models[i], away[:nv], 1.0, nominal[:nq], state[:nq])
+                            np.subtract(state[nq:], nominal[nq:], out=away[nv:])
+                            control = control + gain @ away
+                        np.minimum(np.maximum(control, lower), upper, out=chosen)
+                        ctrl[:] = chosen
+                        mujoco.mj_step(models[i], one.data, num_substeps)
+                        mujoco.mj_getState(models[i], one.data, end, _MOTION)
+                        state = end
 
             self._share(work, len(models))
         return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
@@ -124,9 +122,8 @@ class Engine:
 
         Those of the sensors, "C" and "D", are of small differences with either gradient.
 
-        States before each step are in `start`, with an axis of steps as inputs have it. A step may be several of MuJoCo's
-        under one input; "end" is the state after it, NaN if it is not finite. Differences where no surface is near may be
-        to one side.
+        States before each step are in `start`, with an axis of steps as inputs have it. A step may be several of MuJoCo's;
+        "end" is the state after it, NaN if it is not finite. Away from surfaces differences may be to one side.
         """
         with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 2, numbers, start, inputs)
@@ -137,12 +134,9 @@ class Engine:
             shapes, size = self.shapes(wanted, sizes).items(), (num_substeps, len(rows))
             found = {k: np.full((*size, *shape), np.nan if k == "end" else 0.0) for k, shape in shapes}
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
-
-            def work(one: _Worker, piece: range) -> None:
+            for one in self.workers:
                 one.begin(gradient, is_centred)
-                one.fill(models, speeds, rows, piece, found)
-
-            self._share(work, len(rows))
+            self._share(lambda one, piece: one.fill(models, speeds, rows, piece, found), len(rows))
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
         for t, matrix in enumerate(found["state"][1:], 1):
             own = {name: found[name][t] for name in wanted if name != "end"} | {"state": 0.0}
@@ -169,7 +163,7 @@ class Engine:
             first = self._rows({**start, **{name: value[:, 0] for name, value in inputs.items()}})
             speeds = self._reached(start["qvel"], num_steps)
 
-            def work(one: _Worker, piece: range) -> None:
+            def work(one: _Worker, piece: list[int]) -> None:
                 one.begin(gradient)
                 for i in piece:
                     one.use(models, i, speeds)
@@ -185,10 +179,9 @@ class Engine:
         own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
         return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k]) for k in wanted}
 
-    def _share(self, work: Callable[["_Worker", range], None], count: int) -> None:
+    def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
         """Do so many things on all threads; each takes its piece of them."""
-        num = min(_NUM_THREADS, count)
-        pieces = [range(count)[count * i // num : count * (i + 1) // num] for i in range(num)]
+        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(_NUM_THREADS, count))]
         list(map(work, self.workers, pieces) if len(pieces) == 1 else self.threads.map(work, self.workers, pieces))
 
     def _reached(self, speeds: np.ndarray, num_steps: int) -> np.ndarray:
@@ -225,13 +218,6 @@ class Engine:
             rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
         return rows
 
-    def _part(self, rows: np.ndarray, spec: int) -> np.ndarray:
-        """Return what of whole states belongs to a part of them."""
-        found = np.zeros((len(rows), mujoco.mj_stateSize(self.mj_model, spec)))
-        for row, part in zip(rows, found, strict=True):
-            mujoco.mj_extractState(self.mj_model, row, _ALL, part, spec)
-        return found
-
 
 class _Worker:
     """The steps and Jacobians of one thread, which keeps its data and its copy of a model."""
@@ -241,7 +227,7 @@ class _Worker:
         self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
 
     @np.errstate(invalid="ignore", over="ignore")
-    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: range, found: dict) -> None:
+    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: list[int], found: dict) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
         num_steps, is_finite = len(rows) // len(models), np.isfinite(rows).all(axis=1).tolist()
         for i in index:
@@ -271,7 +257,7 @@ class _Worker:
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
         plain = self.models[0]
-        parts, row, change = [self.places[name] for name in START[1:]], row.copy(), change.copy()
+        row, change = row.copy(), change.copy()
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
                 row[self.places[name]] = value[t].reshape(-1)
@@ -292,25 +278,21 @@ class _Worker:
                 sides.append(self._moved(model, clear, side * rest))
                 sides[-1][self.places["ctrl"]] += side * push
             change = moved + self._difference(model, *sides) / (2 * width)
-            for place, end in zip(parts, ends, strict=True):
-                row[place] = end
             row[self.places["time"]] += model.opt.timestep
-            for name, value in zip(START[1:], ends, strict=True):
-                found[name][t] = value
+            for name, end in zip(START[1:], ends, strict=True):
+                row[self.places[name]] = found[name][t] = end
             found["change"][t] = change
 
     def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray | None:
         """Write the Jacobians of a step, and return the state after it where that is finite."""
-        end = np.empty_like(row)
-        mujoco.mj_setState(model, self.data, row, _ALL)
-        mujoco.mj_step(model, self.data)
+        end, after = np.empty_like(row), self._step(model, row)[1]
         mujoco.mj_getState(model, self.data, end, _ALL)
         if not np.isfinite(end).all():
             return None
         if "end" in found:
-            found["end"][:] = end[self.engine.motion]
+            mujoco.mj_getState(model, self.data, found["end"], _MOTION)
         row[self.places["warmstart"]] = end[self.places["warmstart"]]
-        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]])
+        model, near, spanned, clear = self._near(model, row, after)
         self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
         if near is None:
             return end
@@ -398,7 +380,10 @@ class _Worker:
         nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), nu))
         if is_refused:  # by MuJoCo's own function
-            self._by_columns(model, row, found, width)
+            for column, change in enumerate(np.eye(len(found["state"]))):
+                found["state"][:, column] = self._along(model, row, change, width)
+                if "C" in found:
+                    found["C"][:, column] = self.sensed / (2 * width)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
@@ -414,12 +399,6 @@ class _Worker:
                 found[name][:, column] = self._difference(model, *ends) / (2 * width)
                 if name == "ctrl" and "D" in found:
                     found["D"][:, column] = self.sensed / (2 * width)
-
-    def _by_columns(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
-        for column, change in enumerate(np.eye(len(found["state"]))):
-            found["state"][:, column] = self._along(model, row, change, width)
-            if "C" in found:
-                found["C"][:, column] = self.sensed / (2 * width)
 
     def _by_number(self, model: mujoco.MjModel, row: np.ndarray, name: str, jacobian: np.ndarray) -> None:
         """Write differences by the entries of an array of the model."""

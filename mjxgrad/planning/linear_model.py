@@ -34,6 +34,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
 from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
+from mjxgrad.rollouts.arguments import native_motion
 from mjxgrad.stepping import Smoothing
 
 _Samples = Float[Array, "N both"]
@@ -59,10 +60,6 @@ class Smoother(eqx.Module):
     @abstractmethod
     def step(self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray) -> StateVector:
         """Return the next state of the smoothed system."""
-
-    def native(self, system: System) -> SceneSystem | None:
-        """Return the system to be stepped if C MuJoCo steps it, without samples."""
-        return None
 
     @abstractmethod
     def linear_model(
@@ -94,16 +91,17 @@ class Analytic(Smoother):
     def linear_model(self, system, state, control, key):
         native, system = self.native(system), self._smoothed(system)
         if native is not None:
-            end, jacobian = native.linearised(state, control)
-            change = system.difference(end, end)  # not finite where the end is not
+            end, change, jacobian = native.linearised(state, control)
         else:
             noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
             end, (change,), (jacobian,) = _linearised(system, state, control, noise)
         return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
 
-    def native(self, system):
+    def native(self, system: System) -> SceneSystem | None:
+        """Return the system to be stepped, if C MuJoCo steps it and so does a trajectory in one call."""
         system = self._smoothed(system)
-        return system if isinstance(system, SceneSystem) and system.native else None
+        is_native = isinstance(system, SceneSystem) and native_motion(system.scene, system.contact) is not None
+        return system if is_native else None
 
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)

@@ -23,11 +23,12 @@ from mjxgrad.rollouts import State
 from mjxgrad.rollouts.arguments import arguments_of, native_motion
 from mjxgrad.rollouts.state import check_scene, data_of, state_of
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Discrete, OwnMotion, check_contact, step
+from mjxgrad.stepping import Contact, Discrete, check_contact, step
 
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]
 ChangeVector = Float[Array, " n"]
+_Jacobian = Float[Array, "n both"]
 
 
 class System(eqx.Module):
@@ -133,28 +134,21 @@ class SceneSystem(System):
         """Return a rollout's state as a vector, without time and warm start."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
-    def positions(self, state: Float[Array, "*batch state"]) -> Float[Array, "*batch nq"]:
-        """Return the qpos of states."""
-        return state[..., : self.scene.model.nq]
-
-    @property
-    def native(self) -> OwnMotion | None:
-        """How C MuJoCo steps the scene; None where MJX does."""
-        return native_motion(self.scene, self.contact)
-
     def steer(self, **law: Array) -> tuple[Float[Array, "states state"], Float[Array, "horizon m"]]:
         """Return C MuJoCo's states and controls under a feedback law, see `native.engine.Engine.steer`."""
         begin, resting = arguments_of(self.scene, self._unflattened(law["states"][0]))
         return steer(self.scene, {"time": begin["time"], **resting}, law, self.num_substeps)
 
-    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, Float[Array, "n both"]]:
-        """Return C MuJoCo's next state, and its derivative by state and control."""
+    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, ChangeVector, _Jacobian]:
+        """Return C MuJoCo's next state; and no change, NaN if there is no state, with its derivative by state and control."""
         begin, resting = arguments_of(self.scene, self._unflattened(state))
         inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
         # Differences to one side are off by a few roundings of single precision, and take half as long.
-        how = {"num_substeps": self.num_substeps, "is_centred": state.dtype != jnp.float32}
-        found = linearise(self.scene, begin, inputs, gradient=self.native.gradient, wanted=("ctrl", "end"), **how)
-        return found["end"], jnp.concatenate([found["state"], found["ctrl"]], axis=1)
+        how = {"gradient": native_motion(self.scene, self.contact).gradient, "is_centred": state.dtype != jnp.float32}
+        how |= {"wanted": ("ctrl", "end"), "num_substeps": self.num_substeps}
+        found = linearise(self.scene, begin, inputs, **how)
+        jacobian, end = jnp.concatenate([found["state"], found["ctrl"]], axis=1), found["end"]
+        return end, self.difference(end, end), jacobian
 
     def _unflattened(self, state: StateVector) -> State:
         nq, nv = self.scene.model.nq, self.scene.model.nv

@@ -26,7 +26,8 @@ _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
 _TOLERANCE = 1e-4
 # An influence of controls on a coordinate counts as zero below this many rounding units of the largest influence.
 _ROUNDINGS = 100
-# Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking.
+# Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking. Two or three
+# suffice for a few controls; the others cost little beside a step of the dynamics.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
 
@@ -150,7 +151,8 @@ class Problem(eqx.Module):
             control = jnp.clip(jnp.where(follows, moved, control), self.lower, self.upper)
             return smoother.step(self.system, state, control, key), (state, control)
 
-        if (native := smoother.native(self.system)) is not None:
+        native = smoother.native(self.system) if isinstance(smoother, Analytic) else None
+        if native is not None:
             given = course.controls + jnp.where(follows, step * law.change, 0.0)
             full = {"controls": given, "gain": law.gain, "follows": follows, "lower": self.lower, "upper": self.upper}
             states, controls = native.steer(states=course.states[:-1], **full)
@@ -384,19 +386,16 @@ def minimise_in_box(
         slope = hessian @ x + gradient
         return slope, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
 
-    def improve(carry):
-        number, _, x = carry
+    def improve(_, x):
         slope, is_free = free(x)
         direction = -_solve_free(hessian, slope[:, None], is_free)[:, 0]
         # Backtracking with all lengths at once: a loop of its own would wait for the slowest problem under vmap.
         tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)
         values = jax.vmap(value)(tried)
         best = jnp.argmin(values)
-        is_better = values[best] < value(x)
-        return number + 1, is_better, jnp.where(is_better, tried[best], x)
+        return jnp.where(values[best] < value(x), tried[best], x)
 
-    start = (0, jnp.asarray(True), jnp.clip(jnp.zeros_like(gradient), lower, upper))
-    x = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < _NEWTON_STEPS), improve, start)[2]
+    x = jax.lax.fori_loop(0, _NEWTON_STEPS, improve, jnp.clip(jnp.zeros_like(gradient), lower, upper))
     slope, is_free = free(x)
     rounding = 1e3 * jnp.finfo(x.dtype).eps * (jnp.abs(hessian) @ jnp.abs(x) + jnp.abs(gradient))
     is_sound = jnp.all(jnp.isfinite(x)) & jnp.all(~is_free | (jnp.abs(slope) <= rounding))

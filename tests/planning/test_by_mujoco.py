@@ -1,6 +1,7 @@
 """Plans by C MuJoCo: the motion is its own, and an iteration asks it twice."""
 
 import collections
+import dataclasses
 import functools
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.native.engine import Engine
-from mjxgrad.planning import Controller, Exact, GoalCost, SceneSystem
+from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, SceneSystem
 from mjxgrad.planning.trajectory import Course, Feedback, Problem
 
 # A box with an arm, which slides on the floor and turns.
@@ -21,12 +22,6 @@ BOX = """<mujoco><option timestep=".01"/><worldbody><geom type="plane" size="2 2
 HORIZON = 6
 
 
-class StepByStep(SceneSystem):
-    """The same system by its step alone."""
-
-    native = None
-
-
 @pytest.fixture(params=["double", "single"])
 def error(request):
     """The tolerance: what the solves leave, from another warm start, or roundings of single precision."""
@@ -34,8 +29,14 @@ def error(request):
         yield 1e-6 if request.param == "double" else 2e-4
 
 
-def system_by(kind=SceneSystem):
-    return kind(scene=mg.load_scene(BOX), num_substeps=2, contact=mg.Discrete("mujoco"))
+@pytest.fixture
+def system(error):
+    return SceneSystem(scene=mg.load_scene(BOX), num_substeps=2, contact=mg.Discrete("mujoco"))
+
+
+def by_steps(monkeypatch):
+    """From here on plans call C MuJoCo in each step."""
+    monkeypatch.setattr(Analytic, "native", lambda smoother, system: None)
 
 
 def start_of(system):
@@ -50,8 +51,7 @@ def controller_of(system):
     return Controller(system, GoalCost(goal, 1.0, 10.0, 0.01), jnp.zeros((HORIZON, 2)), schedule=[1.0, 1.0])
 
 
-def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(error):
-    system = system_by()
+def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):
     scene, nq, start, controller = system.scene, system.scene.model.nq, start_of(system), controller_of(system)
     for _ in range(2):
         controller(np.asarray(start))
@@ -62,13 +62,13 @@ def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(error):
     assert np.abs(controller.plan.controls).min() > 1e-3
 
 
-def test_an_iteration_asks_c_mujoco_twice(monkeypatch):
+@pytest.mark.parametrize("error", ["double"], indirect=True)
+def test_an_iteration_asks_c_mujoco_twice(monkeypatch, system):
     """Once for all linear models, and once for all step lengths; a call for each step would be seen."""
     counts = collections.Counter()
     for name in ("run", "steer", "linearise", "follow"):
         monkeypatch.setattr(Engine, name, _counted(counts, name))
-    controller = controller_of(system_by())
-    state = np.asarray(start_of(controller.system))
+    controller, state = controller_of(system), np.asarray(start_of(system))
     controller(state)
     counts.clear()
     controller(state)
@@ -85,19 +85,20 @@ def _counted(counts, name):
     return call
 
 
-def test_a_plan_is_that_of_single_steps(error):
-    ours, other = (controller_of(system_by(kind)) for kind in (SceneSystem, StepByStep))
-    for controller in (ours, other):
-        first = controller(np.asarray(start_of(controller.system)))
-        assert np.abs(first).max() > 0.1
+def test_a_plan_is_that_of_single_steps(error, system, monkeypatch):
+    start, ours = np.asarray(start_of(system)), controller_of(system)
+    by_steps(monkeypatch)
+    other = controller_of(system)
+    assert np.abs(ours(start) - other(start)).max() < 100 * error
     np.testing.assert_allclose(ours.plan.states, other.plan.states, atol=10 * error)
     np.testing.assert_allclose(ours.plan.controls, other.plan.controls, atol=100 * error)
     np.testing.assert_allclose(ours.plan.cost, other.plan.cost, rtol=error)
+    assert np.abs(ours.plan.controls).min() > 1e-3
 
 
-def test_a_law_turns_a_free_body_as_single_steps_do(error):
+def test_a_law_turns_a_free_body_as_single_steps_do(error, system, monkeypatch):
     """Around states that it is not at; a step of zero repeats the controls, even under gains that are NaN."""
-    system, rng = system_by(), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     start, dtype = start_of(system), system.origin.dtype
     changes, gain = (rng.normal(size=(HORIZON, *sizes, system.num_changes)) for sizes in ((), (2,)))
     nominal = jax.vmap(system.retract, (None, 0))(start, jnp.asarray(0.1 * changes, dtype).at[0].set(0.0))
@@ -106,13 +107,15 @@ def test_a_law_turns_a_free_body_as_single_steps_do(error):
     course = Course(jnp.concatenate([nominal, nominal[-1:]]), controls, jnp.zeros((), dtype))
     keys = jax.random.split(jax.random.key(0), HORIZON)
 
-    def run(system, step, factor):
+    def run(step, factor):
         problem = Problem(system, GoalCost(start, 1.0, 1.0, 1.0), Exact(), keys, -limits, limits)
         law = Feedback(change, factor * jnp.asarray(gain, dtype), jnp.zeros((), dtype), jnp.asarray(True))
         return problem.run(Exact(), course, law, step)
 
     given = (jnp.array([0.5, 0.0], dtype), jnp.array([1.0, jnp.nan], dtype))
-    found, expected = (jax.vmap(functools.partial(run, one))(*given) for one in (system, system_by(StepByStep)))
+    found = jax.vmap(run)(*given)
+    by_steps(monkeypatch)
+    expected = jax.vmap(run)(*given)
     np.testing.assert_allclose(found.states, expected.states, atol=10 * error)
     np.testing.assert_allclose(found.controls, expected.controls, atol=10 * error)
     np.testing.assert_array_equal(found.controls[1], np.clip(controls, -limits, limits))
@@ -121,13 +124,12 @@ def test_a_law_turns_a_free_body_as_single_steps_do(error):
 
 
 @pytest.mark.parametrize("gradient", [mg.Discrete, mg.Slope])
-def test_linear_models_are_those_of_single_steps(error, gradient):
-    kinds = (SceneSystem, StepByStep)
-    systems = [kind(scene=mg.load_scene(BOX), num_substeps=2, contact=gradient("mujoco")) for kind in kinds]
-    given = (start_of(systems[0]), jnp.array([0.3, -0.2]))
-    found, expected = (
-        jax.jit(lambda *at, one=system: Exact().linear_model(one, *at, None))(*given) for system in systems
-    )
+def test_linear_models_are_those_of_single_steps(error, system, monkeypatch, gradient):
+    system = dataclasses.replace(system, contact=gradient("mujoco"))
+    given = (start_of(system), jnp.array([0.3, -0.2]), None)
+    found = jax.jit(functools.partial(Exact().linear_model, system))(*given)
+    by_steps(monkeypatch)
+    expected = jax.jit(functools.partial(Exact().linear_model, system))(*given)
     np.testing.assert_allclose(found.c, expected.c, atol=error)
     for name in ("A", "B"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=error * np.abs(expected.A).max())
