@@ -63,7 +63,7 @@ def roll_out(
             is_by_step = name in by_input
             change = change.reshape(horizon, -1) if is_by_step else change.reshape(-1)
             forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
-        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731
+        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
         changes = {k: zero(by_start[k]) for k in found}
         first = jnp.concatenate([to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
 

@@ -224,18 +224,18 @@ class _Worker:
 
     def __init__(self, engine: Engine):
         self.engine, self.data, self.places = engine, mujoco.MjData(engine.mj_model), engine.places
-        self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
+        self.given = self.model = engine.mj_model  # as given, and as differences take it
 
     @np.errstate(invalid="ignore", over="ignore")
     def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: list[int], found: dict) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
-        num_steps, is_finite = len(rows) // len(models), np.isfinite(rows).all(axis=1).tolist()
+        num_steps = len(rows) // len(models)
         for i in index:
             self.use(models, i // num_steps, speeds)
-            row = rows[i].copy() if is_finite[i] else None
+            row = rows[i].copy() if np.isfinite(rows[i]).all() else None
             for t in range(len(found["state"])):
                 if row is not None:
-                    row = self._one(self.models[1], row, {name: value[t, i] for name, value in found.items()})
+                    row = self._one(self.model, row, {name: value[t, i] for name, value in found.items()})
 
     def begin(self, gradient: Gradient, is_centred: bool = True) -> None:
         """Take a gradient for what follows."""
@@ -244,26 +244,25 @@ class _Worker:
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
         given = models[index]
-        if given is not self.models[0]:
-            model = copy.deepcopy(given)
-            model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
-            self.models = (given, model)
+        if given is not self.given:
+            self.given, self.model = given, copy.deepcopy(given)
+            self.model.opt.tolerance, self.model.opt.iterations = _TOLERANCE, max(_ITERATIONS, given.opt.iterations)
         if self.gradient == "slope" and given is not self.near_to:
-            alike, model = [k for k, one in enumerate(models) if one is given], self.models[1]
+            alike, model = [k for k, one in enumerate(models) if one is given], self.model
             self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
             self.near_to, self.far = given, mujoco.MjData(self.surfaces.model)
 
     @np.errstate(invalid="ignore", over="ignore")
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
-        plain = self.models[0]
+        plain = self.given
         row, change = row.copy(), change.copy()
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            model, near, spanned, clear = self._near(self.models[1], row, ends[1])
+            model, near, spanned, clear = self._near(self.model, row, ends[1])
             nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
             if near is not None and near.events is not None:
                 felt = near.events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])

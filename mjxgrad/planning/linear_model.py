@@ -100,8 +100,8 @@ class Analytic(Smoother):
     def native(self, system: System) -> SceneSystem | None:
         """Return the system to be stepped, if C MuJoCo steps it and so does a trajectory in one call."""
         system = self._smoothed(system)
-        is_native = isinstance(system, SceneSystem) and native_motion(system.scene, system.contact) is not None
-        return system if is_native else None
+        if isinstance(system, SceneSystem) and native_motion(system.scene, system.contact) is not None:
+            return system
 
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)

@@ -144,7 +144,7 @@ class SceneSystem(System):
         begin, resting = arguments_of(self.scene, self._unflattened(state))
         inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
         # Differences to one side are off by a few roundings of single precision, and take half as long.
-        how = {"gradient": native_motion(self.scene, self.contact).gradient, "is_centred": state.dtype != jnp.float32}
+        how = {"gradient": self.contact.gradient, "is_centred": state.dtype != jnp.float32}  # pyright: ignore
         how |= {"wanted": ("ctrl", "end"), "num_substeps": self.num_substeps}
         found = linearise(self.scene, begin, inputs, **how)
         jacobian, end = jnp.concatenate([found["state"], found["ctrl"]], axis=1), found["end"]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import form, instance, known, whole
+from mjxgrad._arrays import form, instance, is_known, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad.native import INPUTS, engine_of
 from mjxgrad.rollouts.state import State, check_scene
@@ -86,7 +86,7 @@ def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str
     """Return a state, and the scene's inputs beside controls where C MuJoCo begins with others, as `native` takes them."""
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
     resting, given = engine_of(scene.mj_model).start, {name: getattr(scene.data, name) for name in INPUTS[1:]}
-    is_own = lambda name: np.array_equal(known(given[name]), getattr(resting, name))  # noqa: E731
+    is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(resting, name))  # noqa: E731
     return start, {name: value for name, value in given.items() if value.size and not is_own(name)}
 
 
