@@ -98,7 +98,7 @@ class Analytic(Smoother):
         return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
 
     def native(self, system: System) -> SceneSystem | None:
-        """Return the system to be stepped, if C MuJoCo steps it and so does a trajectory in one call."""
+        """Return the system to be stepped if C MuJoCo steps it, a whole trajectory in one call; otherwise None."""
         system = self._smoothed(system)
         if isinstance(system, SceneSystem) and native_motion(system.scene, system.contact) is not None:
             return system
