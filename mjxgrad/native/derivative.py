@@ -65,7 +65,9 @@ def roll_out(
             forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
         zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
         changes = {k: zero(by_start[k]) for k in found}
-        first = jnp.concatenate([to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
+        to_tangent = functools.partial(position_change, scene.model, start["qpos"])
+        moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
+        first = jnp.concatenate([moved, changes["qvel"], changes["act"]])
 
         def advance(change: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
             matrix, force = step
@@ -122,11 +124,6 @@ def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
         return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
 
     return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
-
-
-def to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
-    """Return a change of coordinates in tangent space."""
-    return jax.jvp(lambda end: position_change(scene.model, qpos, end), (qpos,), (change,))[1]
 
 
 def to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:

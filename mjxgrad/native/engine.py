@@ -284,14 +284,16 @@ class _Worker:
 
     def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray | None:
         """Write the Jacobians of a step, and return the state after it where that is finite."""
-        end, after = np.empty_like(row), self._step(model, row)[1]
+        end = np.empty_like(row)
+        mujoco.mj_setState(model, self.data, row, _ALL)
+        mujoco.mj_step(model, self.data)
         mujoco.mj_getState(model, self.data, end, _ALL)
         if not np.isfinite(end).all():
             return None
         if "end" in found:
             mujoco.mj_getState(model, self.data, found["end"], _MOTION)
         row[self.places["warmstart"]] = end[self.places["warmstart"]]
-        model, near, spanned, clear = self._near(model, row, after)
+        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]])
         self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
         if near is None:
             return end

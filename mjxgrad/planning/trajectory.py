@@ -26,8 +26,8 @@ _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
 _TOLERANCE = 1e-4
 # An influence of controls on a coordinate counts as zero below this many rounding units of the largest influence.
 _ROUNDINGS = 100
-# Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking. Two or three
-# suffice for a few controls; the others cost little beside a step of the dynamics.
+# Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking. Two or
+# three suffice for a few controls; then nothing changes.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
 
@@ -386,16 +386,19 @@ def minimise_in_box(
         slope = hessian @ x + gradient
         return slope, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
 
-    def improve(_, x):
+    def improve(carry):
+        number, _, x = carry
         slope, is_free = free(x)
         direction = -_solve_free(hessian, slope[:, None], is_free)[:, 0]
         # Backtracking with all lengths at once: a loop of its own would wait for the slowest problem under vmap.
         tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)
         values = jax.vmap(value)(tried)
         best = jnp.argmin(values)
-        return jnp.where(values[best] < value(x), tried[best], x)
+        is_better = values[best] < value(x)
+        return number + 1, is_better, jnp.where(is_better, tried[best], x)
 
-    x = jax.lax.fori_loop(0, _NEWTON_STEPS, improve, jnp.clip(jnp.zeros_like(gradient), lower, upper))
+    start = (0, jnp.asarray(True), jnp.clip(jnp.zeros_like(gradient), lower, upper))
+    x = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < _NEWTON_STEPS), improve, start)[2]
     slope, is_free = free(x)
     rounding = 1e3 * jnp.finfo(x.dtype).eps * (jnp.abs(hessian) @ jnp.abs(x) + jnp.abs(gradient))
     is_sound = jnp.all(jnp.isfinite(x)) & jnp.all(~is_free | (jnp.abs(slope) <= rounding))
