@@ -26,8 +26,7 @@ _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
 _TOLERANCE = 1e-4
 # An influence of controls on a coordinate counts as zero below this many rounding units of the largest influence.
 _ROUNDINGS = 100
-# Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking. Two or
-# three suffice for a few controls; then nothing changes.
+# Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
 

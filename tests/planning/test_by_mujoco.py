@@ -15,9 +15,9 @@ from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, SceneSystem
 from mjxgrad.planning.trajectory import Course, Feedback, Problem
 
 # A box with an arm, which slides on the floor and turns.
-BOX = """<mujoco><option timestep=".01"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .1"><freejoint name="box"/>
-  <geom type="box" size=".1 .15 .1"/><body pos="0 0 .1"><joint name="arm" axis="0 1 0"/>
-  <geom type="capsule" fromto="0 0 0 0 0 .3" size=".03"/></body></body></worldbody>
+BOX = """<mujoco><option timestep=".01" cone="elliptic"/><worldbody><geom type="plane" size="2 2 .1"/>
+  <body pos="0 0 .1"><freejoint name="box"/><geom type="box" size=".1 .15 .1"/><body pos="0 0 .1">
+  <joint name="arm" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .3" size=".03"/></body></body></worldbody>
   <actuator><motor joint="box" gear="40 10 0 0 0 20"/><motor joint="arm" ctrlrange="-1 1"/></actuator></mujoco>"""
 HORIZON = 6
 
