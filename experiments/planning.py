@@ -148,7 +148,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             advance_to(len(attempts))
     # The scene itself under the plan's controls, every time step kept.
     system = task.system
-    state = mg.initial_state(system.scene, qpos=system.positions(task.start))
+    state = mg.initial_state(system.scene, qpos=task.start[: system.scene.model.nq])
     controls = jnp.repeat(jnp.asarray(attempts[0].controls), system.num_substeps, axis=0)
     trajectory = eqx.filter_jit(mg.rollout)(system.scene, state, controls)
     return Outcome(settings, attempts, np.asarray(trajectory.qpos), float(system.scene.model.opt.timestep))

@@ -7,6 +7,7 @@ takes a change of the start to the end. JAX transposes that recursion, so forwar
 import functools
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,14 +57,17 @@ def roll_out(
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        jacobians = _jacobians(engine, gradient, tuple(given), numbers, before, inputs)
+        jacobians = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=tuple(given))
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():
             is_by_step = name in by_input
             change = change.reshape(horizon, -1) if is_by_step else change.reshape(-1)
             forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
-        changes = {k: _or_zero(by_start[k]) for k in found}
-        first = jnp.concatenate([to_tangent(scene, start["qpos"], changes["qpos"]), changes["qvel"], changes["act"]])
+        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
+        changes = {k: zero(by_start[k]) for k in found}
+        to_tangent = functools.partial(position_change, scene.model, start["qpos"])
+        moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
+        first = jnp.concatenate([moved, changes["qvel"], changes["act"]])
 
         def advance(change: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
             matrix, force = step
@@ -80,25 +84,32 @@ def roll_out(
     return found["qpos"], found["qvel"], found["act"]
 
 
-def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
-    """Return the Jacobians of one step by "state" and "ctrl", and those of its sensors, "C" and "D"; see `roll_out`."""
+def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tuple[Array, Array]:
+    """Return states and controls of a feedback law in one call, see `Engine.steer`."""
+    engine, first = engine_of(scene.mj_model), law["states"][0]
+    shapes = {name: jax.ShapeDtypeStruct(law[name].shape, first.dtype) for name in ("states", "controls")}
+    function = functools.partial(engine.steer, num_substeps, first.dtype)
+    found = _callback(function, shapes, changed_numbers(scene), start, law)
+    return jnp.concatenate([first[None], found["states"]]), found["controls"]
+
+
+def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, **how: Any) -> dict[str, Array]:
+    """Return the Jacobians of one step by "state" and all that is wanted, see `Engine.linearise`."""
     before = {name: x[None] for name, x in start.items()}
-    found = _jacobians(engine_of(scene.mj_model), gradient, ("ctrl", "C", "D"), changed_numbers(scene), before, inputs)
+    found = _jacobians(engine_of(scene.mj_model), changed_numbers(scene), before, inputs, **how)
     return {name: value[0] for name, value in found.items()}
 
 
-def _jacobians(
-    engine: Engine, gradient: Gradient, wanted: tuple[str, ...], numbers: _Arrays, before: _Arrays, inputs: _Arrays
-) -> dict[str, Array]:
+def _jacobians(engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, **how: Any) -> dict[str, Array]:
     """Return what `Engine.linearise` gives of states before each step; it has no derivative of its own."""
     horizon, dtype = len(inputs["ctrl"]), before["qpos"].dtype
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
-    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(wanted, sizes).items()}
+    shapes = {name: (horizon, *shape) for name, shape in engine.shapes(how["wanted"], sizes).items()}
     shapes = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
 
     @jax.custom_jvp
     def call(numbers, before, inputs):
-        return _callback(functools.partial(engine.linearise, gradient, wanted), shapes, numbers, before, inputs)
+        return _callback(functools.partial(engine.linearise, **how), shapes, numbers, before, inputs)
 
     @call.defjvp
     def _refuse(primals, tangents):
@@ -113,15 +124,6 @@ def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
         return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
 
     return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
-
-
-def _or_zero(tangent) -> Array:
-    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent  # pyright: ignore[reportArgumentType]
-
-
-def to_tangent(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
-    """Return a change of coordinates in tangent space."""
-    return jax.jvp(lambda end: position_change(scene.model, qpos, end), (qpos,), (change,))[1]
 
 
 def to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:

@@ -6,7 +6,7 @@ import functools
 import math
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -24,6 +24,7 @@ INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "moc
 START = ("time", "qpos", "qvel", "act")
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
+_MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE_ACT.value
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
@@ -46,7 +47,6 @@ class Engine:
     def __init__(self, mj_model: mujoco.MjModel):
         self.mj_model, self.lock = mj_model, threading.Lock()
         self.pool, self.threads = mujoco.rollout.Rollout(nthread=_NUM_THREADS), ThreadPoolExecutor(_NUM_THREADS)
-        self.data = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
         self.start = mujoco.MjData(mj_model)
         self.plain = copy.deepcopy(mj_model)
         # A state that is not finite stays so, and is seen.
@@ -58,31 +58,72 @@ class Engine:
         self.places = {
             name: slice(begins[name], begins[name] + mujoco.mj_stateSize(mj_model, bit)) for name, bit in bits.items()
         }
+        self.workers = [_Worker(self) for _ in range(_NUM_THREADS)]
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
         """Return positions, velocities and activations after each step."""
         with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
             rows = self._rows(start)
-            full, user = (self._part(rows, spec) for spec in (_FULL, _USER))
+            full = np.zeros((len(rows), mujoco.mj_stateSize(self.mj_model, _FULL)))
+            for row, part in zip(rows, full, strict=True):
+                mujoco.mj_extractState(self.mj_model, row, _ALL, part, _FULL)
+            user = rows[:, self.places["ctrl"].start : self.places["mocap_quat"].stop]
             given = np.repeat(user[:, None], inputs["ctrl"].shape[1], axis=1)
             for name, value in inputs.items():
                 place = self.places[name].start - self.places["ctrl"].start
                 width = math.prod(value.shape[2:])
                 given[..., place : place + width] = value.reshape(*value.shape[:2], width)
-            found = self.pool.rollout(models, self.data, full, given, control_spec=_USER)[0]
-        ends = np.cumsum([1, self.mj_model.nq, self.mj_model.nv, self.mj_model.na])
-        parts = np.split(np.asarray(found), ends, axis=2)[1:4]
-        return {name: part.reshape(*batch, *part.shape[1:]) for name, part in zip(START[1:], parts, strict=True)}
+            found = self.pool.rollout(models, [one.data for one in self.workers], full, given, control_spec=_USER)[0]
+        parts = {name: np.asarray(found)[..., self.places[name]] for name in START[1:]}
+        return {name: part.reshape(*batch, *part.shape[1:]) for name, part in parts.items()}
+
+    def steer(
+        self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
+    ) -> dict[str, np.ndarray]:
+        """Return states and controls under a law: controls that a gain corrects by the distance from nominal states, in limits.
+
+        A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
+        """
+        with self.lock, collected():
+            batch, models, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
+            nq, nv = self.mj_model.nq, self.mj_model.nv
+            found = {"states": np.zeros(law["states"].shape), "controls": np.zeros(law["controls"].shape, dtype)}
+            columns = (*(law[name] for name in ("states", "controls", "gain")), *found.values())
+            rows = self._rows(start)
+
+            @np.errstate(invalid="ignore", over="ignore")
+            def work(one: _Worker, piece: list[int]) -> None:
+                away, ctrl = np.zeros(law["gain"].shape[3]), one.data.ctrl
+                for i in piece:
+                    state = law["states"][i, 0]
+                    follows, lower, upper = (law[name][i] for name in ("follows", "lower", "upper"))
+                    mujoco.mj_setState(models[i], one.data, rows[i], _ALL)
+                    mujoco.mj_setState(models[i], one.data, state, _MOTION)
+                    for nominal, control, gain, end, chosen in zip(*(x[i] for x in columns), strict=True):
+                        if follows:
+                            mujoco.mj_differentiatePos(models[i], away[:nv], 1.0, nominal[:nq], state[:nq])
+                            np.subtract(state[nq:], nominal[nq:], out=away[nv:])
+                            control = control + gain @ away
+                        np.minimum(np.maximum(control, lower), upper, out=chosen)
+                        ctrl[:] = chosen
+                        mujoco.mj_step(models[i], one.data, num_substeps)
+                        mujoco.mj_getState(models[i], one.data, end, _MOTION)
+                        state = end
+
+            self._share(work, len(models))
+        return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
 
     def linearise(
-        self, gradient: Gradient, wanted: tuple[str, ...], numbers: _Arrays, start: _Arrays, inputs: _Arrays
-    ) -> dict[str, np.ndarray]:
+        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *,
+        gradient: Gradient, wanted: tuple[str, ...], num_substeps: int = 1, is_centred: bool = True,
+    ) -> dict[str, np.ndarray]:  # fmt: skip
         """Return the Jacobians of single steps in tangent space, by "state" and by each input and number that is wanted.
 
         Those of the sensors, "C" and "D", are of small differences with either gradient.
 
-        States before each step are in `start`, with an axis of steps as inputs have it.
+        States before each step are in `start`, with an axis of steps as inputs have it. A step may be several of MuJoCo's;
+        "end" is the state after it, NaN if it is not finite. Away from surfaces differences may be to one side.
         """
         with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 2, numbers, start, inputs)
@@ -90,16 +131,17 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            found = {k: np.zeros((len(rows), *shape)) for k, shape in self.shapes(wanted, sizes).items()}
-            pieces = np.array_split(np.arange(len(rows)), min(_NUM_THREADS, len(rows)))
-
-            def work(thread: int) -> None:
-                _Linearisation(self, self.data[thread], gradient).fill(
-                    models, start["qvel"], rows, pieces[thread], found
-                )
-
-            list(self.threads.map(work, range(len(pieces))))
-        return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in found.items()}
+            shapes, size = self.shapes(wanted, sizes).items(), (num_substeps, len(rows))
+            found = {k: np.full((*size, *shape), np.nan if k == "end" else 0.0) for k, shape in shapes}
+            speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
+            for one in self.workers:
+                one.begin(gradient, is_centred)
+            self._share(lambda one, piece: one.fill(models, speeds, rows, piece, found), len(rows))
+        total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
+        for t, matrix in enumerate(found["state"][1:], 1):
+            own = {name: found[name][t] for name in wanted if name != "end"} | {"state": 0.0}
+            total |= {name: matrix @ total[name] + value for name, value in own.items()}
+        return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in total.items()}
 
     def follow(
         self,
@@ -119,30 +161,33 @@ class Engine:
             sizes = {"qpos": model.nq, "qvel": model.nv, "act": model.na, "change": 2 * model.nv + model.na}
             found = {name: np.zeros((len(models), num_steps, size)) for name, size in sizes.items()}
             first = self._rows({**start, **{name: value[:, 0] for name, value in inputs.items()}})
+            speeds = self._reached(start["qvel"], num_steps)
 
-            # Speeds are not known before, so margins reach as far as those of twice the start's, or of a fall.
-            fall = num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity)
-            speeds = np.maximum(2 * np.abs(start["qvel"]), fall)
-
-            def work(piece: tuple[int, np.ndarray]) -> None:
-                one = _Linearisation(self, self.data[piece[0]], gradient)
-                for i in piece[1].tolist():
+            def work(one: _Worker, piece: list[int]) -> None:
+                one.begin(gradient)
+                for i in piece:
                     one.use(models, i, speeds)
                     course = ({k: v[i] for k, v in inputs.items()}, changes[0][i], changes[1][i])
                     one.follow(first[i], *course, {k: v[i] for k, v in found.items()})
 
-            list(
-                self.threads.map(
-                    work, enumerate(np.array_split(np.arange(len(models)), min(_NUM_THREADS, len(models))))
-                )
-            )
+            self._share(work, len(models))
         return found
 
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, int]]:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
-        by_sensor = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu)}
-        return {"state": (size, size)} | {k: by_sensor[k] if k in by_sensor else (size, sizes[k]) for k in wanted}
+        own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
+        return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k]) for k in wanted}
+
+    def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
+        """Do so many things on all threads; each takes its piece of them."""
+        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(_NUM_THREADS, count))]
+        list(map(work, self.workers, pieces) if len(pieces) == 1 else self.threads.map(work, self.workers, pieces))
+
+    def _reached(self, speeds: np.ndarray, num_steps: int) -> np.ndarray:
+        """Return speeds for margins in later steps, which are not known before: twice those of the start, or of a fall."""
+        model = self.mj_model
+        return np.maximum(2 * np.abs(speeds), num_steps * model.opt.timestep * np.linalg.norm(model.opt.gravity))
 
     def _flat(self, ndim: int, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> tuple:
         """Return the batch's shape, one model for each of it or for all, and the arrays with one axis for the batch's."""
@@ -173,53 +218,51 @@ class Engine:
             rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
         return rows
 
-    def _part(self, rows: np.ndarray, spec: int) -> np.ndarray:
-        """Return what of whole states belongs to a part of them."""
-        found = np.zeros((len(rows), mujoco.mj_stateSize(self.mj_model, spec)))
-        for row, part in zip(rows, found, strict=True):
-            mujoco.mj_extractState(self.mj_model, row, _ALL, part, spec)
-        return found
 
+class _Worker:
+    """The steps and Jacobians of one thread, which keeps its data and its copy of a model."""
 
-class _Linearisation:
-    """The Jacobians of steps by one thread."""
-
-    def __init__(self, engine: Engine, data: mujoco.MjData, gradient: Gradient):
-        self.engine, self.data, self.gradient, self.places = engine, data, gradient, engine.places
-        self.models: tuple[mujoco.MjModel | None, ...] = (None, None)
+    def __init__(self, engine: Engine):
+        self.engine, self.data, self.places = engine, mujoco.MjData(engine.mj_model), engine.places
+        self.given = self.model = engine.mj_model  # as given, and as differences take it
 
     @np.errstate(invalid="ignore", over="ignore")
-    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: np.ndarray, found: dict) -> None:
+    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: list[int], found: dict) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
         num_steps = len(rows) // len(models)
-        for i in index.tolist():
+        for i in index:
             self.use(models, i // num_steps, speeds)
-            if np.isfinite(rows[i]).all():
-                self._one(self.models[1], rows[i].copy(), {name: value[i] for name, value in found.items()})
+            row = rows[i].copy() if np.isfinite(rows[i]).all() else None
+            for t in range(len(found["state"])):
+                if row is not None:
+                    row = self._one(self.model, row, {name: value[t, i] for name, value in found.items()})
+
+    def begin(self, gradient: Gradient, is_centred: bool = True) -> None:
+        """Take a gradient for what follows."""
+        self.gradient, self.is_centred, self.near_to = gradient, is_centred, None
 
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
-        if models[index] is self.models[0]:
-            return
-        model = copy.deepcopy(models[index])
-        model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
-        self.models = (models[index], model)
-        if self.gradient == "slope":
-            alike = [k for k, one in enumerate(models) if one is models[index]]
+        given = models[index]
+        if given is not self.given:
+            self.given, self.model = given, copy.deepcopy(given)
+            self.model.opt.tolerance, self.model.opt.iterations = _TOLERANCE, max(_ITERATIONS, given.opt.iterations)
+        if self.gradient == "slope" and given is not self.near_to:
+            alike, model = [k for k, one in enumerate(models) if one is given], self.model
             self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
-            self.far = mujoco.MjData(self.surfaces.model)
+            self.near_to, self.far = given, mujoco.MjData(self.surfaces.model)
 
     @np.errstate(invalid="ignore", over="ignore")
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
-        plain = self.models[0]
-        parts, row, change = [self.places[name] for name in START[1:]], row.copy(), change.copy()
+        plain = self.given
+        row, change = row.copy(), change.copy()
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            model, near, spanned, clear = self._near(self.models[1], row, ends[1])
+            model, near, spanned, clear = self._near(self.model, row, ends[1])
             nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
             if near is not None and near.events is not None:
                 felt = near.events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
@@ -234,22 +277,26 @@ class _Linearisation:
                 sides.append(self._moved(model, clear, side * rest))
                 sides[-1][self.places["ctrl"]] += side * push
             change = moved + self._difference(model, *sides) / (2 * width)
-            for place, end in zip(parts, ends, strict=True):
-                row[place] = end
             row[self.places["time"]] += model.opt.timestep
-            for name, value in zip(START[1:], ends, strict=True):
-                found[name][t] = value
+            for name, end in zip(START[1:], ends, strict=True):
+                row[self.places[name]] = found[name][t] = end
             found["change"][t] = change
 
-    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> None:
-        _, after, _ = self._step(model, row)
-        if not np.isfinite(after).all():
-            return
-        row[self.places["warmstart"]] = self.data.qacc_warmstart
-        model, near, spanned, clear = self._near(model, row, after)
-        self._differentiate(model, clear, found, self._width(near))
+    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray | None:
+        """Write the Jacobians of a step, and return the state after it where that is finite."""
+        end = np.empty_like(row)
+        mujoco.mj_setState(model, self.data, row, _ALL)
+        mujoco.mj_step(model, self.data)
+        mujoco.mj_getState(model, self.data, end, _ALL)
+        if not np.isfinite(end).all():
+            return None
+        if "end" in found:
+            mujoco.mj_getState(model, self.data, found["end"], _MOTION)
+        row[self.places["warmstart"]] = end[self.places["warmstart"]]
+        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]])
+        self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
         if near is None:
-            return
+            return end
         matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
         if events is not None:
             rest -= events.moves @ events.rows
@@ -262,6 +309,7 @@ class _Linearisation:
             matrix[:, :nv] = matrix[:, :nv] @ rest
         if events is not None:
             matrix[:, :nv] += spanned @ events.rows
+        return end
 
     def _visibly(
         self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray, near: Near
@@ -327,18 +375,21 @@ class _Linearisation:
         return np.array(columns).T
 
     def _differentiate(
-        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float
+        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, is_centred: bool
     ) -> None:
         """Write differences of this width by all that is wanted."""
         nu, is_refused = model.nu, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        by_control = found.get("ctrl", np.zeros((len(found["state"]), nu)))
+        by_control = found["ctrl"] if "ctrl" in found else np.zeros((len(found["state"]), nu))
         if is_refused:  # by MuJoCo's own function
-            self._by_columns(model, row, found, width)
+            for column, change in enumerate(np.eye(len(found["state"]))):
+                found["state"][:, column] = self._along(model, row, change, width)
+                if "C" in found:
+                    found["C"][:, column] = self.sensed / (2 * width)
         else:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
-            mujoco.mjd_transitionFD(model, self.data, width, True, found["state"], by_control, *sensors)
-        for name in found.keys() - {"state", "C", "D"} - ({"ctrl"} if not is_refused else set()):
+            mujoco.mjd_transitionFD(model, self.data, width, is_centred, found["state"], by_control, *sensors)
+        for name in found.keys() - {"state", "C", "D", "end"} - ({"ctrl"} if not is_refused else set()):
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
                 continue
@@ -349,12 +400,6 @@ class _Linearisation:
                 found[name][:, column] = self._difference(model, *ends) / (2 * width)
                 if name == "ctrl" and "D" in found:
                     found["D"][:, column] = self.sensed / (2 * width)
-
-    def _by_columns(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float) -> None:
-        for column, change in enumerate(np.eye(len(found["state"]))):
-            found["state"][:, column] = self._along(model, row, change, width)
-            if "C" in found:
-                found["C"][:, column] = self.sensed / (2 * width)
 
     def _by_number(self, model: mujoco.MjModel, row: np.ndarray, name: str, jacobian: np.ndarray) -> None:
         """Write differences by the entries of an array of the model."""

@@ -34,6 +34,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
 from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
+from mjxgrad.rollouts.arguments import native_motion
 from mjxgrad.stepping import Smoothing
 
 _Samples = Float[Array, "N both"]
@@ -88,10 +89,19 @@ class Analytic(Smoother):
         return self._smoothed(system).step(state, control)
 
     def linear_model(self, system, state, control, key):
-        system = self._smoothed(system)
-        noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
-        end, (change,), (jacobian,) = _linearised(system, state, control, noise)
+        native, system = self.native(system), self._smoothed(system)
+        if native is not None:
+            end, change, jacobian = native.linearised(state, control)
+        else:
+            noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
+            end, (change,), (jacobian,) = _linearised(system, state, control, noise)
         return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
+
+    def native(self, system: System) -> SceneSystem | None:
+        """Return the system to be stepped if C MuJoCo steps it, a whole trajectory in one call; otherwise None."""
+        system = self._smoothed(system)
+        if isinstance(system, SceneSystem) and native_motion(system.scene, system.contact) is not None:
+            return system
 
     def _smoothed(self, system: System) -> System:
         return system if self.smoothing is None else system.with_contact(self.smoothing)

@@ -17,7 +17,7 @@ from mjxgrad._arrays import whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native import roll_out
+from mjxgrad.native import linearise, roll_out, steer
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 from mjxgrad.rollouts.arguments import arguments_of, native_motion
@@ -28,6 +28,7 @@ from mjxgrad.stepping import Contact, Discrete, check_contact, step
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]
 ChangeVector = Float[Array, " n"]
+_Jacobian = Float[Array, "n both"]
 
 
 class System(eqx.Module):
@@ -133,16 +134,30 @@ class SceneSystem(System):
         """Return a rollout's state as a vector, without time and warm start."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
-    def positions(self, state: Float[Array, "*batch state"]) -> Float[Array, "*batch nq"]:
-        """Return the qpos of states."""
-        return state[..., : self.scene.model.nq]
+    def steer(self, **law: Array) -> tuple[Float[Array, "states state"], Float[Array, "horizon m"]]:
+        """Return C MuJoCo's states and controls under a feedback law, see `native.engine.Engine.steer`."""
+        begin, resting = arguments_of(self.scene, self._unflattened(law["states"][0]))
+        return steer(self.scene, {"time": begin["time"], **resting}, law, self.num_substeps)
+
+    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, ChangeVector, _Jacobian]:
+        """Return C MuJoCo's next state; and no change, NaN if there is no state, with its derivative by state and control."""
+        begin, resting = arguments_of(self.scene, self._unflattened(state))
+        inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
+        # Differences to one side are off by a few roundings of single precision, and take half as long.
+        how = {"gradient": self.contact.gradient, "is_centred": state.dtype != jnp.float32}  # pyright: ignore
+        how |= {"wanted": ("ctrl", "end"), "num_substeps": self.num_substeps}
+        found = linearise(self.scene, begin, inputs, **how)
+        jacobian, end = jnp.concatenate([found["state"], found["ctrl"]], axis=1), found["end"]
+        return end, self.difference(end, end), jacobian
+
+    def _unflattened(self, state: StateVector) -> State:
+        nq, nv = self.scene.model.nq, self.scene.model.nv
+        qvel = state[nq : nq + nv]
+        return State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
 
     @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
-        nq, nv = self.scene.model.nq, self.scene.model.nv
-        qvel = state[nq : nq + nv]
-        start = State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
-        native = native_motion(self.scene, self.contact)
+        start, native = self._unflattened(state), native_motion(self.scene, self.contact)
         if native is not None:
             begin, resting = arguments_of(self.scene, start)
             inputs = jax.tree.map(lambda x: jnp.stack([x] * self.num_substeps), resting | {"ctrl": control})

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
 from mjxgrad._arrays import instance, known, one_key
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
-from mjxgrad.planning.linear_model import Analytic, LinearModel, Smoother
+from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 from mjxgrad.rollouts.arguments import sequence_of
 
@@ -26,8 +26,7 @@ _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
 _TOLERANCE = 1e-4
 # An influence of controls on a coordinate counts as zero below this many rounding units of the largest influence.
 _ROUNDINGS = 100
-# Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking. Two or three
-# suffice for a few controls; the others cost little beside a step of the dynamics.
+# Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
 
@@ -140,7 +139,7 @@ class Problem(eqx.Module):
         least = jnp.asarray(_LEAST_REGULARISATION, start.dtype)
         return Search(given, given, least, jnp.zeros(self.system.num_changes, bool))
 
-    def run(self, smoother: Smoother | None, course: Course, law: Feedback, step: ArrayLike) -> Course:
+    def run(self, smoother: Smoother, course: Course, law: Feedback, step: ArrayLike) -> Course:
         """Follow a course under a feedback law; a step of zero repeats its controls."""
         follows = jnp.asarray(step) > 0
 
@@ -149,13 +148,17 @@ class Problem(eqx.Module):
             away = self.system.difference(state, nominal)
             moved = control + step * change + jnp.where(follows, gain @ away, 0.0)
             control = jnp.clip(jnp.where(follows, moved, control), self.lower, self.upper)
-            if smoother is None:
-                return self.system.step(state, control), (state, control)
             return smoother.step(self.system, state, control, key), (state, control)
 
-        inputs = (course.states[:-1], course.controls, law.change, law.gain, self.keys)
-        final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
-        states = jnp.concatenate([states, final[None]])
+        native = smoother.native(self.system) if isinstance(smoother, Analytic) else None
+        if native is not None:
+            given = course.controls + jnp.where(follows, step * law.change, 0.0)
+            full = {"controls": given, "gain": law.gain, "follows": follows, "lower": self.lower, "upper": self.upper}
+            states, controls = native.steer(states=course.states[:-1], **full)
+        else:
+            inputs = (course.states[:-1], course.controls, law.change, law.gain, self.keys)
+            final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
+            states = jnp.concatenate([states, final[None]])
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
@@ -284,7 +287,7 @@ def iterate(
     index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
     course = jax.tree.map(lambda x: x[index], tried)
     is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None
-    true = course if is_exact else problem.run(None, course, law, 0.0)
+    true = course if is_exact else problem.run(Exact(), course, law, 0.0)
     is_better = is_first | (true.cost < search.best.cost)
     best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
     # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
@@ -382,16 +385,19 @@ def minimise_in_box(
         slope = hessian @ x + gradient
         return slope, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
 
-    def improve(_, x):
+    def improve(carry):
+        number, _, x = carry
         slope, is_free = free(x)
         direction = -_solve_free(hessian, slope[:, None], is_free)[:, 0]
         # Backtracking with all lengths at once: a loop of its own would wait for the slowest problem under vmap.
         tried = jnp.clip(x + _SHORTENING[:, None].astype(x.dtype) * direction, lower, upper)
         values = jax.vmap(value)(tried)
         best = jnp.argmin(values)
-        return jnp.where(values[best] < value(x), tried[best], x)
+        is_better = values[best] < value(x)
+        return number + 1, is_better, jnp.where(is_better, tried[best], x)
 
-    x = jax.lax.fori_loop(0, _NEWTON_STEPS, improve, jnp.clip(jnp.zeros_like(gradient), lower, upper))
+    start = (0, jnp.asarray(True), jnp.clip(jnp.zeros_like(gradient), lower, upper))
+    x = jax.lax.while_loop(lambda carry: carry[1] & (carry[0] < _NEWTON_STEPS), improve, start)[2]
     slope, is_free = free(x)
     rounding = 1e3 * jnp.finfo(x.dtype).eps * (jnp.abs(hessian) @ jnp.abs(x) + jnp.abs(gradient))
     is_sound = jnp.all(jnp.isfinite(x)) & jnp.all(~is_free | (jnp.abs(slope) <= rounding))

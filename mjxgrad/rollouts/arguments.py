@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import form, instance, known, whole
+from mjxgrad._arrays import form, instance, is_known, known, whole
 from mjxgrad._mjx import mjx
-from mjxgrad.native import INPUTS
+from mjxgrad.native import INPUTS, engine_of
 from mjxgrad.rollouts.state import State, check_scene
 from mjxgrad.scene import Scene, SceneError
 from mjxgrad.stepping import Contact, OwnMotion, check_contact
@@ -83,9 +83,11 @@ def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
 
 
 def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return a state, and the scene's resting inputs beside controls, as `native` takes them."""
+    """Return a state, and the scene's inputs beside controls where C MuJoCo begins with others, as `native` takes them."""
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
-    return start, {name: getattr(scene.data, name) for name in INPUTS[1:] if getattr(scene.data, name).size}
+    resting, given = engine_of(scene.mj_model).start, {name: getattr(scene.data, name) for name in INPUTS[1:]}
+    is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(resting, name))  # noqa: E731
+    return start, {name: value for name, value in given.items() if value.size and not is_own(name)}
 
 
 def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:

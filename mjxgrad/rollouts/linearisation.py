@@ -49,7 +49,7 @@ def linearise(
     if native is not None:
         start, resting = arguments_of(scene, state)
         inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
-        found = by_mujoco(scene, start, inputs, native.gradient)
+        found = by_mujoco(scene, start, inputs, gradient=native.gradient, wanted=("ctrl", "C", "D"))
         return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
     end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
