@@ -112,7 +112,7 @@ History = dict[str, Float[np.ndarray, "updates seeds"]]
 class Course:
     """What one method did at one stiffness, for all seeds."""
 
-    method: str
+    method: Method
     stiffness: float
     history: History
     returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
@@ -270,7 +270,7 @@ def _by_ppo(
 def _judged_course(
     settings: Settings,
     environment: Environment,
-    method: str,
+    method: Method,
     stiffness: float,
     learned: Any,
     act: Callable[[Any, Any], Any],
