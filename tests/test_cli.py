@@ -9,8 +9,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import cli
+from tests.processes import ROOT, run_python
 
-ROOT = Path(__file__).parents[1]
 SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/><body pos="0 0 .2">
   <joint name="z" type="slide" axis="0 0 1"/><geom size=".05" mass=".2"/></body></worldbody>
   <actuator><motor name="push" joint="z" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
@@ -94,8 +94,7 @@ def test_importing_the_library_imports_no_command_line_and_no_pictures():
     """Nor what only experiments need."""
     heavy = ("cyclopts", "OpenGL", "gymnasium", "brax", "mujoco_playground", "jinja2", "matplotlib", "mediapy")
     code = f"import sys, mjxgrad; print([name for name in {heavy} if name in sys.modules])"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert ran.stdout.strip() == "[]"
+    assert run_python("-c", code)[0].strip() == "[]"
 
 
 def test_without_its_package_the_command_line_says_what_brings_it():

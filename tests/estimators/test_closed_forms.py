@@ -13,9 +13,7 @@ from mjxgrad.objective import closed_loop, open_loop, parameter_noise
 from tests.estimators import textbook
 from tests.estimators.textbook import STDDEV, assert_within_error, first_order, zeroth_order
 
-N = 100_000
-
-
+N = 40_000
 # On all of the problems below α-order must be as right as the unbiased ones, whichever part it chooses.
 ESTIMATORS = {
     "first_order": first_order,

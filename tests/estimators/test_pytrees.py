@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mjxgrad as mg
 from mjxgrad import estimators
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
@@ -65,14 +64,3 @@ def test_both_orders_have_the_form_and_a_batch_keeps_its_variances_apart(key):
     alone = estimators.first_order(VECTOR_OBJECTIVE, 0.5 * VECTOR, key, num_samples=20)
     assert first.value["force"].shape == zeroth.value["force"].shape == (2, 2)
     np.testing.assert_allclose(first.variance[1], alone.variance, rtol=1e-10)
-
-
-def test_a_policy_gets_its_gradient_in_its_own_form(key):
-    policy = {"gain": jnp.array([[0.3, -0.2]]), "offset": jnp.array([0.1])}
-    objective = mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, 0.1, params=policy)
-    for estimator in (estimators.zeroth_order, estimators.alpha_order):
-        compiled = eqx.filter_jit(estimator)
-        tree = compiled(objective, policy, key, num_samples=8)
-        vector = compiled(objective, objective.ravel(policy), key, num_samples=8)
-        assert tree.value["gain"].shape == (1, 2)
-        np.testing.assert_allclose(objective.ravel(tree.value), vector.value, rtol=1e-12)

@@ -58,7 +58,7 @@ def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     longer = learn(num_updates=3, checkpoint=tmp_path / "run")
     np.testing.assert_array_equal(longer.history["reward"][:2], whole.history["reward"])
     assert int(longer.learner.num_updates) == 3
-    other = learning.Settings(num_environments=4, window=3, discount=0.9)
+    other = dataclasses.replace(SMALL, discount=0.9)
     with pytest.raises(ValueError, match=r"of the same run, got .* settings was Settings"):
         learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
 
@@ -75,7 +75,8 @@ def _judged_by(reward):
 
 def test_a_checkpoint_of_another_reward_is_refused(cartpole, key, tmp_path):
     """Same name, same numbers, other code: what was learned for the old reward is not the answer for the new one."""
-    learn = functools.partial(learning.learn, key=key, num_updates=1, settings=SMALL, checkpoint=tmp_path / "run")
+    settings = dataclasses.replace(SMALL, has_critic=False, trace=1.0)
+    learn = functools.partial(learning.learn, key=key, num_updates=1, settings=settings, checkpoint=tmp_path / "run")
     learn(_judged_by(lambda speed: speed)(cartpole.scene))
     with pytest.raises(ValueError, match=r"of the same run, got .* of one with other settings: .*environment"):
         learn(_judged_by(lambda speed: -speed)(cartpole.scene))

@@ -168,10 +168,7 @@ def test_a_runge_kutta_step_spans_all_of_its_stages():
 
 
 def test_where_contact_chatters_the_slope_is_that_of_short_time_steps():
-    """A ball that a servo's box pushes along the floor.
-
-    MuJoCo's own slope at 2 ms is twice its limit's, an artefact of the step.
-    """
+    """A ball that a servo's box pushes along the floor: MuJoCo's own slope at 2 ms is twice its limit's."""
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
         <body pos="-.3 0 .1"><joint name="p" type="slide" axis="1 0 0" damping="1"/><geom type="box" size=".05 .2 .05" mass="1"/>

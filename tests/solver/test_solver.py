@@ -54,10 +54,7 @@ def _on_its_way(settings, speed):
 
 
 def test_a_sliding_ball_under_an_elliptic_cone_is_pushed_as_in_c():
-    """Three balls through contact, one of them MuJoCo's default: the acceleration in each of C's states is that of C.
-
-    C stops where the cost improves by less than 1e-15 of its scale, hence 1e-6 of the largest acceleration.
-    """
+    """In each of C's states through contact, which stops at an improvement of 1e-15: hence 1e-6 of the largest acceleration."""
     cases = [_on_its_way(*case) for case in ((_HARD, 60.66), (_SOFT, 6.862), ({}, 100.0))]
     base, data = mjx.put_model(cases[0][0]), mjx.make_data(cases[0][0])
     fields = ("geom_friction", "geom_solref", "geom_solimp")

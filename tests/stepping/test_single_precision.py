@@ -99,7 +99,9 @@ def test_contacts_of_nearly_symmetric_poses_have_both_derivatives(pair):
     contacts, around = _contacts(pair), width * jnp.concatenate([eye, -eye])
     near = lambda rest, pose: jax.vmap(contacts, (0, None))(rest + around, pose)  # noqa: E731
     there, slope, beside = _over_poses(contacts, jax.jacfwd(contacts), near)
-    right, left = ((x - there[:, None, 1]) / w for x, w in zip(np.split(beside[..., 1], 2, 1), (width, -width), strict=True))
+    right, left = (
+        (x - there[:, None, 1]) / w for x, w in zip(np.split(beside[..., 1], 2, 1), (width, -width), strict=True)
+    )
     assert np.isfinite(forward).all()
     assert np.isfinite(reverse).all()
     scale = 1 + np.abs(forward).max(axis=(1, 2), keepdims=True)
@@ -153,9 +155,7 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
   <spatial name="string" stiffness="20" frictionloss=".1"><site site="bob"/><site site="on_ball"/><pulley divisor="2"/>
     <site site="tip"/><site site="on_ball"/></spatial>
   <spatial name="in_ring"><site site="upper"/><geom geom="ring" sidesite="inside"/><site site="lower"/></spatial>
-  <spatial name="round_ring" stiffness="10"><site site="upper"/><geom geom="ring" sidesite="beyond"/><site site="lower"/>
-    </spatial>
-  <spatial name="round_ball"><site site="upper"/><geom geom="ball_at_elbow"/><site site="on_axis"/></spatial>
+  {wrapped}
 </tendon>
 {equality}
 <actuator>
@@ -172,6 +172,9 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
     <motor joint="free" gear="1 0 0 0 .1 0"/>
 </actuator>
 {sensors}</mujoco>"""
+_WRAPPED = """<spatial name="round_ring" stiffness="10"><site site="upper"/><geom geom="ring" sidesite="beyond"/>
+    <site site="lower"/></spatial>
+  <spatial name="round_ball"><site site="upper"/><geom geom="ball_at_elbow"/><site site="on_axis"/></spatial>"""
 _SENSORS = """<sensor>
   <velocimeter site="bob"/><gyro site="bob"/><magnetometer site="bob"/>
   <camprojection site="bob" camera="eye"/><rangefinder site="down"/><rangefinder site="aside"/><rangefinder site="missing"/>
@@ -245,7 +248,7 @@ def _slopes_in_c(model, start, size):
 @pytest.mark.parametrize("is_all", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forces", "all"])
 def test_a_step_of_nearly_everything_has_both_derivatives(is_all):
     """Those of C MuJoCo's step, between the slopes on both sides where a limit or the end of a spring is just there."""
-    parts = {"flag": "", "held": _HELD, "equality": _EQUALITY, "sensors": _SENSORS}
+    parts = {"flag": "", "held": _HELD, "equality": _EQUALITY, "wrapped": _WRAPPED, "sensors": _SENSORS}
     without = dict.fromkeys(parts, "") | {"flag": '<flag constraint="disable"/>'}
     text = ZOO.format(**parts if is_all else without)
     model = mujoco.MjModel.from_xml_string(text)
