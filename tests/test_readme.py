@@ -104,7 +104,7 @@ _CHECKS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "check"), enumerate(_CHECKS), ids=[check.__name__[1:] for check in _CHECKS])
+@pytest.mark.parametrize(("number", "check"), list(enumerate(_CHECKS)), ids=[check.__name__[1:] for check in _CHECKS])
 def test_how_tos_run_and_do_their_job(number, check, tmp_path, monkeypatch):
     if check is _descends_by_pytorch:
         pytest.importorskip("torch")

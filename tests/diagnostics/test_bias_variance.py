@@ -26,7 +26,7 @@ def ramps():
         POINTS,
         jax.random.key(0),
         softness=WIDTHS,
-        num_samples=2000,
+        num_samples=4000,
     )
 
 

@@ -154,8 +154,10 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
   <fixed name="slack" stiffness="50" springlength="-.05 .05"><joint joint="drag" coef="1"/></fixed>
   <spatial name="string" stiffness="20" frictionloss=".1"><site site="bob"/><site site="on_ball"/><pulley divisor="2"/>
     <site site="tip"/><site site="on_ball"/></spatial>
-  <spatial name="in_ring"><site site="upper"/><geom geom="ring" sidesite="inside"/><site site="lower"/></spatial>
-  {wrapped}
+  <spatial name="round_ring" stiffness="10"><site site="upper"/><geom geom="ring" sidesite="beyond"/><site site="lower"/>
+    </spatial>
+  <spatial name="round_ball"><site site="upper"/><geom geom="ball_at_elbow"/><site site="on_axis"/></spatial>
+  {inside}
 </tendon>
 {equality}
 <actuator>
@@ -168,13 +170,14 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
   <position joint="ball" gear="1 0 .3" kp="2"/><position jointinparent="free_ball" gear="0 1 .2" kp="2"/>
   <position site="turned" refsite="world" gear="0 0 0 1 .2 0" kp="2"/>
     <position site="pushed" refsite="world" gear="1 0 .5 0 0 0" kp="2"/>
-  <motor site="still" gear="1 0 0 0 0 .1"/><motor tendon="sum"/><position tendon="in_ring" kp="3"/>
+  <motor site="still" gear="1 0 0 0 0 .1"/><motor tendon="sum"/>{pulled}
     <motor joint="free" gear="1 0 0 0 .1 0"/>
 </actuator>
 {sensors}</mujoco>"""
-_WRAPPED = """<spatial name="round_ring" stiffness="10"><site site="upper"/><geom geom="ring" sidesite="beyond"/>
-    <site site="lower"/></spatial>
-  <spatial name="round_ball"><site site="upper"/><geom geom="ball_at_elbow"/><site site="on_axis"/></spatial>"""
+_INSIDE = (
+    '<spatial name="in_ring"><site site="upper"/><geom geom="ring" sidesite="inside"/><site site="lower"/></spatial>'
+)
+_PULLED = '<position tendon="in_ring" kp="3"/>'
 _SENSORS = """<sensor>
   <velocimeter site="bob"/><gyro site="bob"/><magnetometer site="bob"/>
   <camprojection site="bob" camera="eye"/><rangefinder site="down"/><rangefinder site="aside"/><rangefinder site="missing"/>
@@ -248,7 +251,14 @@ def _slopes_in_c(model, start, size):
 @pytest.mark.parametrize("is_all", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forces", "all"])
 def test_a_step_of_nearly_everything_has_both_derivatives(is_all):
     """Those of C MuJoCo's step, between the slopes on both sides where a limit or the end of a spring is just there."""
-    parts = {"flag": "", "held": _HELD, "equality": _EQUALITY, "wrapped": _WRAPPED, "sensors": _SENSORS}
+    parts = {
+        "flag": "",
+        "held": _HELD,
+        "equality": _EQUALITY,
+        "inside": _INSIDE,
+        "pulled": _PULLED,
+        "sensors": _SENSORS,
+    }
     without = dict.fromkeys(parts, "") | {"flag": '<flag constraint="disable"/>'}
     text = ZOO.format(**parts if is_all else without)
     model = mujoco.MjModel.from_xml_string(text)
