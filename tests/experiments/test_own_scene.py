@@ -72,6 +72,7 @@ def test_mistakes_are_one_sentence(folder, capsys, override, said):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_its_outcome_is_a_sawtooth_of_the_push_and_with_an_onset_a_line(folder):
     """The mean derivative of MuJoCo's step is then not the slope; with an onset it is, within a tenth."""
     own = {"scene": "block.xml", "cost": "costs.py:reward", "start": "near", "horizon": 40}

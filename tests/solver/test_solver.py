@@ -85,21 +85,20 @@ def test_a_rollout_counts_the_steps_whose_solve_was_cut_short():
     assert rising <= 1 < falling
 
 
-@pytest.mark.parametrize(
-    ("friction", "cone", "is_solved"), [(1e-3, "pyramidal", False), (1e-3, "elliptic", True), (0.5, "pyramidal", True)]
-)
-def test_a_rollout_counts_the_steps_that_single_precision_does_not_resolve(friction: float, cone: str, is_solved: bool):
-    """The edges of a pyramid weigh as 1/μ²: at 1e-3 they are 10⁶ times as stiff as their normal."""
+@pytest.mark.parametrize(("cone", "are_solved"), [("pyramidal", [False, True]), ("elliptic", [True, True])])
+def test_a_rollout_counts_the_steps_that_single_precision_does_not_resolve(cone: str, are_solved: list[bool]):
+    """The edges of a pyramid weigh as 1/μ²: at 1e-3 they are 10⁶ times as stiff as their normal, at 0.5 they are not."""
     with jax.enable_x64(False):
         scene = mg.load_scene(_model(height=0.0499, cone=cone))
-        model = scene.model.replace(geom_friction=scene.model.geom_friction.at[:, 0].set(friction))
         spin = jnp.array([0.5, 0.2, 0, 0, 6, 2])
 
-        def iterations(speed):
+        def iterations(friction, speed):
+            model = scene.model.replace(geom_friction=scene.model.geom_friction.at[:, 0].set(friction))
             return mg.step(model, scene.data.replace(qvel=spin.at[2].set(-speed)))._impl.solver_niter
 
-        num_iterations = jax.jit(jax.vmap(iterations))(jnp.array([0.1, 1.0, 10.0]))
-    np.testing.assert_array_equal(num_iterations <= 100, is_solved)
+        each = jax.jit(jax.vmap(jax.vmap(iterations, (None, 0)), (0, None)))
+        num_iterations = each(jnp.array([1e-3, 0.5]), jnp.array([0.1, 1.0, 10.0]))
+    np.testing.assert_array_equal(num_iterations <= 100, np.tile(are_solved, (3, 1)).T)
 
 
 def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
