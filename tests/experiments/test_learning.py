@@ -77,6 +77,7 @@ COMMAND = [
 ]
 
 
+@pytest.mark.slow
 def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
     assert main([*COMMAND, "video.width=64", "--output", str(tmp_path)]) == 0
     folder = tmp_path / "learn_cartpole"

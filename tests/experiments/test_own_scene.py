@@ -46,6 +46,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_bias_and_variance_are_measured_and_a_changed_cost_is_run_again(folder, capsys):
     assert main(["run", "own.toml", "--output", "runs", "--debug"]) == 0
     summary = json.loads((folder / "runs" / "own" / "summary.json").read_text())
