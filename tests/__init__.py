@@ -8,7 +8,7 @@ import sys
 
 from beartype import beartype
 
-_CALLS = 50
+_CALLS = 20
 
 
 def sparing(function):

@@ -120,7 +120,7 @@ def test_derivatives_that_are_no_numbers_are_counted_and_replaced(cartpole, key)
 
 def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
     lost = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.array(jnp.nan))
-    start = ActorCritic(lost, SMALL, 1).init(key)
+    start = eqx.filter_jit(ActorCritic(lost, SMALL, 1).init)(key)
     run = learning.learn(lost, key, num_updates=1, log_every=1, settings=SMALL)
     assert run.history["skipped"][0] == 1
     # Up to rounding, since the start is compiled on its own there; one step of Adam would be 2e-3.
@@ -180,7 +180,7 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
         discount=1.0, trace=1.0, alpha=1.0, has_critic=False,
     )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
-    before = ActorCritic(cartpole, settings, 1).init(key)
+    before = eqx.filter_jit(ActorCritic(cartpole, settings, 1).init)(key)
 
     def loss(actor):
         def advance(state, _):
