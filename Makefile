@@ -45,6 +45,10 @@ setup: .venv/.installed  ## install the tested versions into .venv
 
 demo: ball_wall  ## set all up, run the main job, write runs/ball_wall/report.html
 
+# A compilation takes and gives back memory all the time: kept by the process it costs 4 % less.
+test: export MALLOC_TRIM_THRESHOLD_ ?= 1000000000
+test: export MALLOC_TOP_PAD_ ?= 67108864
+test: export MALLOC_MMAP_THRESHOLD_ ?= 33554432
 test: .venv/.installed  ## set all up and run the tests
 	@$(BIN)/python -m pytest -n 2 --dist worksteal $(PYTEST_ARGS)
 

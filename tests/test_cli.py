@@ -9,8 +9,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import cli
+from tests.processes import ROOT
 
-ROOT = Path(__file__).parents[1]
 SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/><body pos="0 0 .2">
   <joint name="z" type="slide" axis="0 0 1"/><geom size=".05" mass=".2"/></body></worldbody>
   <actuator><motor name="push" joint="z" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
@@ -90,18 +90,13 @@ def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatc
     assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
 
 
-def test_importing_the_library_imports_no_command_line_and_no_pictures():
-    """Nor what only experiments need."""
+def test_the_library_imports_nothing_heavy_and_its_command_line_says_what_it_lacks():
+    """No pictures, nor what only experiments need; then without its own package."""
     heavy = ("cyclopts", "OpenGL", "gymnasium", "brax", "mujoco_playground", "jinja2", "matplotlib", "mediapy")
     code = f"import sys, mjxgrad; print([name for name in {heavy} if name in sys.modules])"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert ran.stdout.strip() == "[]"
-
-
-def test_without_its_package_the_command_line_says_what_brings_it():
-    code = "import sys; sys.modules['cyclopts'] = None; import mjxgrad.__main__"
+    code += "; sys.modules['cyclopts'] = None; import mjxgrad.__main__"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert ran.returncode == 2
+    assert (ran.returncode, ran.stdout.strip()) == (2, "[]")
     assert ran.stderr == "the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'\n"
 
 

@@ -1,9 +1,9 @@
 """Compiled programs kept for the next process; in processes of their own, as JAX reads its settings once."""
 
 import os
-import subprocess
-import sys
 import textwrap
+
+from tests.processes import run_python
 
 _KEPT = """
     import jax
@@ -21,19 +21,14 @@ _KEPT = """
 
 
 def _run_keeping(caches):
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(_KEPT)],
-        env={**environment, "XDG_CACHE_HOME": str(caches), "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return *done.stdout.split(), done.stderr
+    printed, said = run_python("-c", textwrap.dedent(_KEPT), XDG_CACHE_HOME=str(caches))
+    return *printed.split(), said
 
 
-def test_programs_are_kept_for_the_next_process(tmp_path):
+def test_programs_are_kept_for_the_next_process(tmp_path, monkeypatch):
     """Its programs are read, not compiled; damaged ones are said in one line, and where nothing can be written nothing is."""
+    for name in [name for name in os.environ if name.startswith("JAX_")]:
+        monkeypatch.delenv(name)
     folder, none, _ = _run_keeping(tmp_path)
     assert folder.startswith(str(tmp_path / "mjxgrad" / "jaxlib-"))
     assert none == "0"

@@ -88,44 +88,31 @@ def _tells_which_gradient_holds(names):
     assert "<svg" in Path("sweep.html").read_text()
 
 
-_CHECKS = (
-    _moves_and_is_filmed,
-    _finds_the_parameters,
-    _stands,
-    _pushes_the_ball_to_its_place,
-    _balances,
-    _holds_and_learns,
-    _descends_by_pytorch,
-    _rises,
-    _falls_and_swings,
-    _tells_which_gradient_holds,
-)
+# What is looked at after each how-to, and the object that its cell shows in a notebook.
+_CHECKS = {
+    _moves_and_is_filmed: "mg.check(scene, derivatives=False)",
+    _finds_the_parameters: "result",
+    _stands: "learned",
+    _pushes_the_ball_to_its_place: "pusher",
+    _balances: "balance",
+    _holds_and_learns: "",
+    _descends_by_pytorch: "",
+    _rises: "result",
+    _falls_and_swings: "",
+    _tells_which_gradient_holds: "found.result",
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(len(_CHECKS)), ids=[check.__name__[1:] for check in _CHECKS])
-def test_how_tos_run_and_do_their_job(number, tmp_path, monkeypatch):
-    if _CHECKS[number] is _descends_by_pytorch:
+@pytest.mark.parametrize(("number", "check"), list(enumerate(_CHECKS)), ids=[check.__name__[1:] for check in _CHECKS])
+def test_how_tos_run_and_do_their_job(number, check, tmp_path, monkeypatch):
+    if check is _descends_by_pytorch:
         pytest.importorskip("torch")
     monkeypatch.chdir(tmp_path)
     names = {}
     with jax.enable_x64(False):
         exec(compile(_examples("mjxgrad/HOWTO.md")[number], "HOWTO.md", "exec"), names)
-    _CHECKS[number](names)
-
-
-_SHOWN = (
-    "mg.check(scene, derivatives=False)",
-    "result",
-    "learned",
-    "pusher",
-    "balance",
-    "",
-    "",
-    "result",
-    "",
-    "found.result",
-)
+    check(names)
 
 
 @pytest.mark.slow
@@ -133,7 +120,7 @@ def test_the_how_tos_run_as_a_notebook_whose_cells_show_what_print_shows(tmp_pat
     """In one kernel. A cell that ends in an object shows lines of text, and not its arrays."""
     notebook, run, _ = map(pytest.importorskip, ("nbformat.v4", "nbclient", "ipykernel"))
     cells = []
-    for code, last in zip(_examples("mjxgrad/HOWTO.md"), _SHOWN, strict=True):
+    for code, last in zip(_examples("mjxgrad/HOWTO.md"), _CHECKS.values(), strict=True):
         if "import torch" not in code or importlib.util.find_spec("torch"):
             cells += map(notebook.new_code_cell, (code, f"print({last})\n{last}"))
     run.execute(notebook.new_notebook(cells=cells), cwd=tmp_path, timeout=600)

@@ -1,14 +1,12 @@
 """A batch over several devices; in a process of its own, since their number is fixed at the first use of JAX."""
 
-import os
-import subprocess
-import sys
 import textwrap
 
 import jax.numpy as jnp
 import numpy as np
 
 import mjxgrad as mg
+from tests.processes import run_python
 
 _PROGRAM = """
     import jax
@@ -47,13 +45,7 @@ _PROGRAM = """
 
 
 def test_each_device_works_on_its_part_alone():
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(_PROGRAM)],
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    run_python("-c", textwrap.dedent(_PROGRAM))
 
 
 def test_one_device_is_vmap():

@@ -67,10 +67,7 @@ def test_what_rounding_made_indefinite_is_mended_by_the_least_share_of_its_diago
 
 
 def _problem(size, bad=None):
-    """Return a random problem of each kind of row that stands for itself, the force of one member not finite.
-
-    Losses and limits see one joint velocity each, the others see all.
-    """
+    """Return a random problem with all kinds of rows; losses and limits see one joint velocity each, the others all."""
     random = np.random.default_rng(3)
     layout = RowLayout(num_equality=2, num_friction=3, num_rows=30)
     roots = random.normal(size=(_BATCH, size, size))
@@ -101,8 +98,7 @@ def _both(size, iterations=100, bad=None, expected=newton.minimise):
     return [jax.jit(functools.partial(way, layout, iterations))(system, start, tolerance) for way in (expected, kernel)]
 
 
-@pytest.mark.parametrize("size", [7, 20])
-@pytest.mark.parametrize("iterations", [1, 100])
+@pytest.mark.parametrize(("size", "iterations"), [(7, 1), (20, 100)])
 def test_takes_the_same_steps_to_the_same_minimiser(size, iterations):
     """The first step and the end; in between a difference of rounding may send the search along a line another way."""
     way = _one_by_one if iterations == 1 else newton.minimise

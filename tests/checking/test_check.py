@@ -1,5 +1,7 @@
 """Planted faults are named, and what is measured is what closed forms say."""
 
+import functools
+import importlib
 import itertools
 import time
 
@@ -51,13 +53,21 @@ def fault(verdict, kind):
 
 
 @pytest.fixture(scope="module")
-def wall():
-    return mg.check(WALL, budget=1000)
+def measured():
+    """From a scene to its verdict, of as few motions as a large scene gets."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.import_module("mjxgrad.checking.check"), "_BATCHES", (32, 32))
+        yield functools.cache(lambda source: mg.check(source, budget=1000))
 
 
-@pytest.fixture(scope="module")
-def bounce():
-    return mg.check(ball(), budget=1000)
+@pytest.fixture
+def wall(measured):
+    return measured(WALL)
+
+
+@pytest.fixture
+def bounce(measured):
+    return measured(ball())
 
 
 @pytest.mark.parametrize(

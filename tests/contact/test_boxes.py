@@ -109,6 +109,18 @@ def _moved(x, axes, motion):
     return x.at[1].add(motion[:3]), axes.at[1].set(jax.scipy.linalg.expm(skew) @ axes[1])
 
 
+def _outcome(motion, x, axes, half):
+    dist, pos, frame = box_box(*_boxes(*_moved(x, axes, motion), half))
+    return jnp.concatenate([dist, jnp.where(dist[:, None] < ABSENT, pos, 0.0).ravel(), frame[0, 0]])
+
+
+@jax.jit
+def _with_derivatives(*pose):
+    """Return distances, places and normal, and their derivative by a motion of the second box, twice."""
+    outcome, rest = lambda motion: _outcome(motion, *pose), jnp.zeros(6)
+    return outcome(rest), jax.jacfwd(outcome)(rest), central_difference(outcome, rest, 1e-6)
+
+
 @pytest.mark.parametrize("kind", ["face", "edge"])
 def test_the_contacts_of_boxes_have_the_derivative_of_their_points(kind):
     if kind == "edge":
@@ -119,15 +131,7 @@ def test_the_contacts_of_boxes_have_the_derivative_of_their_points(kind):
         mujoco.mju_quat2Mat(turn[1], turn[0])
         start = np.array([[0, 0, 0], [0.03, 0.02, 0.29]]), np.array([np.eye(3), turn[1].reshape(3, 3)])
         half = jnp.array([[0.2, 0.15, 0.1], [0.19, 0.18, 0.2]])
-    x, axes = map(jnp.asarray, start)
-
-    def outcome(motion):
-        dist, pos, frame = box_box(*_boxes(*_moved(x, axes, motion), half))
-        return jnp.concatenate([dist, jnp.where(dist[:, None] < ABSENT, pos, 0.0).ravel(), frame[0, 0]])
-
-    rest = jnp.zeros(6)
-    program = jax.jit(lambda x: (outcome(x), jax.jacrev(outcome)(x), central_difference(outcome, x, 1e-6)))
-    values, *both = program(rest)
+    values, *both = _with_derivatives(*map(jnp.asarray, start), half)
     acting = int(jnp.sum(values[:8] < ABSENT))
     assert acting == 1 if kind == "edge" else acting >= 6
     np.testing.assert_allclose(*both, atol=1e-7)

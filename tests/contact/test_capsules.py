@@ -168,10 +168,7 @@ def test_capsules_whose_axes_cross_touch_along_the_normal_of_both(dtype):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_parallel_capsules_touch_at_the_middle_of_the_first(dtype):
-    """Whichever way they lie; rounding of some 1e-7 m in single precision, over 3e-4, moves it by less than a millimetre.
-
-    The second is turned about its axis, so that the two axes are the same but for rounding.
-    """
+    """The second is turned about its axis. Rounding of 1e-7 m, over 3e-4, moves the place by less than a millimetre."""
     free = '<body><freejoint/><geom type="capsule" size=".05 .3"/></body>'
     mj_model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{free}{free}</worldbody></mujoco>")
     outcome, random = _outcome(mj_model, dtype), np.random.default_rng(0)

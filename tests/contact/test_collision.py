@@ -160,7 +160,7 @@ def test_contacts_of_two_faces_lie_half_way_between_them_as_in_c(kind):
     </mujoco>""")
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
-    found = jax.jit(mg.forward)(scene.model, scene.data)._impl.contact
+    found = _finder(scene.model)(scene.data)
     acts = np.asarray(found.dist) < 0
     ours, theirs = np.asarray(found.pos)[acts].round(9), data.contact.pos.round(9)
     assert len(ours) == len(theirs) == 4
@@ -176,7 +176,7 @@ def test_a_mesh_that_stands_on_three_corners_has_their_contacts():
         <geom type="mesh" mesh="prism"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
-    found = jax.jit(mg.forward)(scene.model, scene.data)._impl.contact
+    found = _finder(scene.model)(scene.data)
     acts = np.asarray(found.dist) < 0
     ours, theirs = (np.unique(x.round(6), axis=0) for x in (np.asarray(found.pos)[acts], data.contact.pos))
     assert acts.sum() == data.ncon == len(theirs) == 3

@@ -46,19 +46,14 @@ def _row(scene, *names):
     return next(i for i, pair in enumerate(scene.pairs) if set(pair.names) == set(names))
 
 
-def test_every_pair_gets_the_values_asked_for(unequal):
-    softness = Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
-    got = unequal.with_softness(softness).contact_parameters()
+def test_every_pair_gets_the_values_asked_for_as_c_mujoco_sees(unequal):
+    softer = unequal.with_softness(Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02))
+    got, model = softer.contact_parameters(), softer.to_mujoco()
     np.testing.assert_allclose(got.stiffness, 900, rtol=1e-12)
     # b = 2ζ√k
     np.testing.assert_allclose(got.damping, 2 * 0.7 * 30, rtol=1e-12)
     np.testing.assert_allclose(got.impedance, [[0.3, 0.6]] * len(unequal.pairs), rtol=1e-12)
     np.testing.assert_allclose(got.width, 0.02, rtol=1e-12)
-
-
-def test_c_mujoco_sees_the_same_softness(unequal):
-    softness = Softness(stiffness=900, damping_ratio=0.7, impedance=(0.3, 0.6), width=0.02)
-    model = unequal.with_softness(softness).to_mujoco()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     assert data.ncon == 3

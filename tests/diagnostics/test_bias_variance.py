@@ -44,7 +44,7 @@ def jumps():
         POINTS,
         jax.random.key(1),
         softness={"height": HEIGHTS},
-        num_samples=4000,
+        num_samples=2000,
         progress=lambda done, total: progress.append((done, total)),
     )
     return table, calls, progress

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.diagnostics.stability import bounce_angle, restitution
 
 SCENE = """
 <mujoco>
@@ -48,10 +49,7 @@ def test_the_load_is_the_step_over_the_closed_form_limit_in_the_standard_format(
     [("Euler", 0.9, 20), *((x, 0.5, c) for x in ("Euler", "RK4") for c in (20, 400, 800))],
 )
 def test_c_mujoco_gains_energy_in_a_held_contact_exactly_where_the_load_exceeds_one(integrator, first, damping, share):
-    """A ball that is pressed into its contact swings ever wider, or comes to rest; at damping ratios of 0.05, 1 and 2.
-
-    Also near the surface of a contact whose impedance falls with depth, where stiffness goes as its square.
-    """
+    """Pressed into its contact; damping ratios of 0.05, 1 and 2, and where impedance falls with depth."""
     solref, solimp = f"-40000 -{damping}", f"{first} .5 .5"
     (unit,) = _report(solref=solref, solimp=solimp, integrator=integrator).springs
     step = 0.002 * share / unit.load
@@ -63,6 +61,18 @@ def test_c_mujoco_gains_energy_in_a_held_contact_exactly_where_the_load_exceeds_
     data.qpos[0] = -(1 - first) * 1000 / (40000 * (first / 0.5) ** 2) - 1e-4
     mujoco.mj_step(model, data, 400)
     assert (np.abs(data.qvel[0]) > 0.1) == (share > 1)
+
+
+def test_a_critically_damped_ball_keeps_the_share_exp_minus_two():
+    """Then x = v t exp(−ω t): its acceleration vanishes at ω t = 2, where the speed is −v exp(−2)."""
+    assert restitution(1.0) == pytest.approx(np.exp(-2), rel=1e-12)
+    assert bounce_angle(1.0) == 1.0
+
+
+def test_nothing_jumps_where_damping_becomes_critical():
+    """About ζ = 1 the angle is 1 + (1 − ζ)/3, to the square of the gap."""
+    for gap in (1e-9, -1e-9, 1e-5, -1e-5):
+        assert bounce_angle(1 - gap) == pytest.approx(1 + gap / 3, abs=1e-10)
 
 
 def test_a_bounce_lasts_and_goes_as_deep_as_the_closed_form_says():

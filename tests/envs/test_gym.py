@@ -16,14 +16,10 @@ from mjxgrad.envs.gym import GymEnv, GymVectorEnv, gym_name
 from mjxgrad.rollouts import initial_state, render
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
+from tests.envs.test_environment import heavier
 
 LENGTH = 3
 ACTION = np.array([0.6], np.float32)
-
-
-def heavier(key, scene):
-    """Carts and poles of one to ten times the mass."""
-    return scene.with_model(body_mass=scene.model.body_mass * jax.random.uniform(key, (), minval=1, maxval=10))
 
 
 @pytest.fixture(scope="module")
@@ -136,12 +132,12 @@ def _layout(x):
 
 
 def test_each_copy_has_its_own_random_mass(cart):
-    """20 N for 17 ms speed them by up to 0.3 m/s, the heaviest by a tenth of it."""
+    """20 N for 17 ms speed them by up to 0.3 m/s, the heaviest by half of it."""
     copies = GymVectorEnv(CartPole(cart.scene, frame_skip=2, randomisation=heavier), 4)
     before, _ = copies.reset(seed=0)
     after, *_ = copies.step(np.ones((4, 1), np.float32))
     gained = after[:, 1] - before[:, 1]
-    assert gained.max() > 2 * gained.min() > 0
+    assert gained.max() > 1.2 * gained.min() > 0
 
 
 def test_pictures_show_the_present_state(one):

@@ -25,10 +25,7 @@ LIFT = 0.9  # m: beyond the heights at which walker, ant and humanoid are health
 
 
 def _theirs(name, num_episodes=4, num_steps=15):
-    """Step gymnasium's robot by random actions: all it told, and the states before and after.
-
-    Two of the episodes start in the air, where some are not healthy; episodes go on after an end.
-    """
+    """Step gymnasium's robot at random, beyond ends, two episodes from the air: all it told, and states before and after."""
     title = "".join(word.capitalize() for word in name.split("_"))
     with pytest.MonkeyPatch.context() as patch:
         # It is imported for windows alone.

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import mjxgrad as mg
 from mjxgrad import estimators
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
@@ -41,8 +40,10 @@ def of_the_vector(name):
     return eqx.filter_jit(getattr(estimators, name))(VECTOR_OBJECTIVE, VECTOR, jax.random.key(7), num_samples=20)
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("name", ["first_order", "zeroth_order", "alpha_order", "control_variate"])
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [*((name, "dict") for name in ("zeroth_order", "alpha_order", "control_variate")), ("first_order", "module")],
+)
 def test_an_estimate_has_the_form_of_the_parameters(key, name, form):
     estimator = functools.partial(getattr(estimators, name), num_samples=20)
     tree = eqx.filter_jit(estimator)(OBJECTIVE, FORMS[form], key)
@@ -65,14 +66,3 @@ def test_both_orders_have_the_form_and_a_batch_keeps_its_variances_apart(key):
     alone = estimators.first_order(VECTOR_OBJECTIVE, 0.5 * VECTOR, key, num_samples=20)
     assert first.value["force"].shape == zeroth.value["force"].shape == (2, 2)
     np.testing.assert_allclose(first.variance[1], alone.variance, rtol=1e-10)
-
-
-def test_a_policy_gets_its_gradient_in_its_own_form(key):
-    policy = {"gain": jnp.array([[0.3, -0.2]]), "offset": jnp.array([0.1])}
-    objective = mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, 0.1, params=policy)
-    for estimator in (estimators.zeroth_order, estimators.alpha_order):
-        compiled = eqx.filter_jit(estimator)
-        tree = compiled(objective, policy, key, num_samples=8)
-        vector = compiled(objective, objective.ravel(policy), key, num_samples=8)
-        assert tree.value["gain"].shape == (1, 2)
-        np.testing.assert_allclose(objective.ravel(tree.value), vector.value, rtol=1e-12)

@@ -100,18 +100,6 @@ def test_adding_a_large_constant_changes_nothing(offset):
     np.testing.assert_allclose(shifted.variance, plain.variance, rtol=1e-4)
 
 
-def test_a_function_with_a_rule_for_reverse_mode_only_is_differentiated_by_it(key):
-    """Few parameters are differentiated in forward mode, which such a function does not have."""
-
-    @jax.custom_vjp
-    def halved(x):
-        return x[0] ** 2
-
-    halved.defvjp(lambda x: (x[0] ** 2, x), lambda x, g: (jnp.array([g * x[0]]),))
-    estimate = first_order(parameter_noise(halved, 0.1), jnp.array([0.3]), key, num_samples=1000)
-    assert abs(estimate.value[0] - 0.3) < 4 * estimate.standard_error[0]
-
-
 @pytest.mark.parametrize("antithetic", [False, True])
 @pytest.mark.parametrize("baseline", ["leave_one_out", "zero_noise", "none"])
 def test_each_baseline_is_what_it_is_called(key, baseline, antithetic):

@@ -66,10 +66,7 @@ def stable(ours, theirs, derivative, silent=0):
 
 
 def taught(stiffness=(1.0,), environment="hopper", late=(), **returns):
-    """Returns of each seed by method, at the first stiffness; a tenth of them at the last, but for the onset.
-
-    The reward rises from 0 to 1 in the second update, of those that are late in the third.
-    """
+    """Returns of each seed by method, a tenth at the last stiffness but for the onset; rewards rise in update 2 or 3."""
     courses = [
         SimpleNamespace(
             method=method,

@@ -1,7 +1,6 @@
 """What the benchmarks promise before they measure."""
 
-import subprocess
-import sys
+from tests.processes import run_python
 
 
 def test_nothing_begins_jax_before_the_number_of_devices_is_read():
@@ -11,4 +10,4 @@ def test_nothing_begins_jax_before_the_number_of_devices_is_read():
         "jax.config.update('jax_num_cpu_devices', 2)\n"
         "assert len(jax.devices('cpu')) == 2"
     )
-    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+    run_python("-c", script)

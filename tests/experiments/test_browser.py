@@ -22,7 +22,6 @@ BROWSER = os.environ.get("CHROME_BIN") or next(
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no browser is installed: CHROME_BIN names one")
 
 WIDTH = 390  # of a telephone, in pixels
-PICTURE = 11 * 96  # pixels from side to side, of a figure of 11 inches
 # The page's own scripts, if it had any, would be refused; this one alone may run.
 PROBE = """\
 <meta http-equiv="Content-Security-Policy"
@@ -30,17 +29,12 @@ PROBE = """\
 <script nonce="probe">
 addEventListener("load", () => {
   const zoom = document.querySelector(".zoom svg");
-  const wide = () => zoom.getBoundingClientRect().width;
   const loaded = [...document.images].every(one => one.naturalWidth > 0);
   const found = {width: innerWidth, beyond: document.documentElement.scrollWidth - innerWidth, loaded};
   if (zoom) {
-    found.before = wide();
+    found.before = zoom.getBoundingClientRect().width;
     found.hint = getComputedStyle(zoom.parentElement, "::before").content;
     found.shade = getComputedStyle(document.querySelector(".scroll:has(> table)")).backgroundImage;
-    zoom.dispatchEvent(new MouseEvent("click", {bubbles: true}));
-    found.full = wide();
-    zoom.dispatchEvent(new MouseEvent("click", {bubbles: true}));
-    found.again = wide();
   }
   parent.postMessage(JSON.stringify(found), "*");
 });

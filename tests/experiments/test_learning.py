@@ -23,18 +23,10 @@ QUICK = Settings(
 
 
 def course(method, returns, **history):
-    names = (
-        "reward",
-        "alpha",
-        "agreement",
-        "first_variance",
-        "zeroth_variance",
-        "not_finite",
-        "skipped",
-        "diverged",
-        "shortened",
+    zero = ("reward", "alpha", "agreement", "not_finite", "skipped", "diverged", "shortened")
+    values = dict.fromkeys(zero, np.zeros((4, 2))) | dict.fromkeys(
+        ("first_variance", "zeroth_variance"), np.ones((4, 2))
     )
-    values = {name: np.ones((4, 2)) if "variance" in name else np.zeros((4, 2)) for name in names}
     values |= {name: np.asarray(value, float) for name, value in history.items()}
     returns = np.asarray(returns, float)
     return Course(method, 1.0, values, returns, returns, {}, np.zeros((3, 2)), 3)
@@ -85,6 +77,7 @@ COMMAND = [
 ]
 
 
+@pytest.mark.slow
 def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
     assert main([*COMMAND, "video.width=64", "--output", str(tmp_path)]) == 0
     folder = tmp_path / "learn_cartpole"

@@ -46,6 +46,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_bias_and_variance_are_measured_and_a_changed_cost_is_run_again(folder, capsys):
     assert main(["run", "own.toml", "--output", "runs", "--debug"]) == 0
     summary = json.loads((folder / "runs" / "own" / "summary.json").read_text())
@@ -72,6 +73,7 @@ def test_mistakes_are_one_sentence(folder, capsys, override, said):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_its_outcome_is_a_sawtooth_of_the_push_and_with_an_onset_a_line(folder):
     """The mean derivative of MuJoCo's step is then not the slope; with an onset it is, within a tenth."""
     own = {"scene": "block.xml", "cost": "costs.py:reward", "start": "near", "horizon": 40}

@@ -116,10 +116,9 @@ def test_starts_and_a_delay_are_found_with_the_parameter(cart):
 
 
 def test_through_a_bounce_the_search_converges_with_an_onset_and_stalls_without():
-    """The height of a drop from where the ball is after the impact, under MuJoCo's default contact.
+    """The height of a drop from the simulation's own course after the impact, to which both could come back exactly.
 
-    The place then moves by −0.14 m per metre of height, and is a sawtooth of −2.4 without an onset. The recorded motion is the
-    simulation's own, so that both could come back to the height exactly.
+    The place then moves by −0.14 m per metre of height, and is a sawtooth of −2.4 without an onset.
     """
     scene = mg.load_scene("""<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body><joint type="slide" axis="0 0 1"/>
         <geom size=".05" mass=".2"/><site name="tip"/></body></worldbody>

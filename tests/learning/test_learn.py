@@ -58,7 +58,7 @@ def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     longer = learn(num_updates=3, checkpoint=tmp_path / "run")
     np.testing.assert_array_equal(longer.history["reward"][:2], whole.history["reward"])
     assert int(longer.learner.num_updates) == 3
-    other = learning.Settings(num_environments=4, window=3, discount=0.9)
+    other = dataclasses.replace(SMALL, discount=0.9)
     with pytest.raises(ValueError, match=r"of the same run, got .* settings was Settings"):
         learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
 
@@ -75,7 +75,8 @@ def _judged_by(reward):
 
 def test_a_checkpoint_of_another_reward_is_refused(cartpole, key, tmp_path):
     """Same name, same numbers, other code: what was learned for the old reward is not the answer for the new one."""
-    learn = functools.partial(learning.learn, key=key, num_updates=1, settings=SMALL, checkpoint=tmp_path / "run")
+    settings = dataclasses.replace(SMALL, has_critic=False, trace=1.0)
+    learn = functools.partial(learning.learn, key=key, num_updates=1, settings=settings, checkpoint=tmp_path / "run")
     learn(_judged_by(lambda speed: speed)(cartpole.scene))
     with pytest.raises(ValueError, match=r"of the same run, got .* of one with other settings: .*environment"):
         learn(_judged_by(lambda speed: -speed)(cartpole.scene))
@@ -119,7 +120,7 @@ def test_derivatives_that_are_no_numbers_are_counted_and_replaced(cartpole, key)
 
 def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
     lost = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.array(jnp.nan))
-    start = ActorCritic(lost, SMALL, 1).init(key)
+    start = eqx.filter_jit(ActorCritic(lost, SMALL, 1).init)(key)
     run = learning.learn(lost, key, num_updates=1, log_every=1, settings=SMALL)
     assert run.history["skipped"][0] == 1
     # Up to rounding, since the start is compiled on its own there; one step of Adam would be 2e-3.
@@ -179,7 +180,7 @@ def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
         discount=1.0, trace=1.0, alpha=1.0, has_critic=False,
     )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
-    before = ActorCritic(cartpole, settings, 1).init(key)
+    before = eqx.filter_jit(ActorCritic(cartpole, settings, 1).init)(key)
 
     def loss(actor):
         def advance(state, _):

@@ -12,6 +12,7 @@ import pytest
 from IPython.lib.pretty import pretty
 
 import mjxgrad as mg
+from mjxgrad import estimators
 from tests.loop import problems
 from tests.loop.problems import CENTRE, CURVATURE, STDDEV, made_up
 
@@ -202,3 +203,41 @@ def test_a_run_of_the_same_program_compiles_nothing_and_what_functions_read_is_r
     assert len(compilations) == before
     target["place"] = 3.0
     np.testing.assert_allclose(again(jnp.array([0.5])), 3.0, atol=0.2)
+
+
+def test_a_schedule_of_noise_is_followed(key):
+    """E[bowl] exceeds bowl by scale² σ²/2 tr C, so the recorded cost tells the noise that was used."""
+    schedule = optax.exponential_decay(1.0, 1, 0.5)
+    result = mg.optimise(
+        lambda scale: problems.objective.with_stddev(0.3 * scale),
+        problems.CENTRE,
+        key,
+        estimator=functools.partial(estimators.zeroth_order, num_samples=4096),
+        optimiser=optax.sgd(0.0),
+        num_steps=4,
+        annealing=schedule,
+    )
+    history, expected = result.history, 0.5 ** np.arange(4)
+    np.testing.assert_allclose(history.scale, expected, rtol=1e-6)
+    truth = (0.3 * expected) ** 2 / 2 * float(problems.CURVATURE.sum())
+    assert np.all(np.abs(history.cost - truth) < 4 * history.cost_error)
+    assert np.all(history.cost_error < 0.1 * truth)
+
+
+def test_the_best_is_sought_where_smoothing_was_least(key):
+    """The cost at much noise is made lower than ever after: it must not win."""
+
+    def estimator(objective, params, key):
+        return made_up(jnp.ones(2), cost=jnp.where(objective.stddev > 0.7, -5.0, params.sum()))
+
+    result = mg.optimise(
+        lambda scale: problems.objective.with_stddev(scale),
+        jnp.zeros(2),
+        key,
+        estimator=estimator,
+        optimiser=optax.sgd(0.1),
+        num_steps=6,
+        annealing=lambda step: jnp.where(step < 3, 1.0, 0.5),
+    )
+    np.testing.assert_allclose(result.best_params, -0.5)
+    np.testing.assert_allclose(result.best_cost, -1.0)

@@ -103,14 +103,6 @@ def test_a_scene_charges_by_step_from_where_it_starts(cart, key):
     assert objective.zero_noise()[1].qpos == 0
 
 
-def test_a_scene_whose_cost_has_another_length_is_refused(cart):
-    wrong = SceneTask(cart.scene, cart.state, lambda trajectory: per_state(trajectory)[1:], horizon=3)
-    with pytest.raises(
-        ValueError, match=r"scalar of shape \(\) or one number per state, shape \(4,\), got shape \(3,\)"
-    ):
-        jax.eval_shape(wrong.run, THRUSTS)
-
-
 def look(model, data):
     """Where the cart is, and how it is pushed: the control before, while a policy looks."""
     return jnp.stack([data.qpos[0], data.qacc[0]])

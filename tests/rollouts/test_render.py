@@ -1,8 +1,5 @@
 """Drawing: on a machine without OpenGL the refusal is tested in place of the pictures."""
 
-import subprocess
-import sys
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,6 +7,7 @@ from numpy.testing import assert_array_equal
 
 from experiments.video import tile
 from mjxgrad.rollouts.render import RenderingUnavailableError, frames, write_video
+from tests.processes import run_python
 
 # A white ball that slides along x, seen from a camera that looks along y: its place in the picture is its place in x.
 SLIDER = """
@@ -160,5 +158,5 @@ except mg.render.RenderingUnavailableError as error:
 
 
 def test_all_but_drawing_works_where_there_is_no_opengl_and_the_error_names_the_packages():
-    done = subprocess.run([sys.executable, "-c", _WITHOUT_OPENGL], capture_output=True, text=True)
-    assert all(x in done.stdout for x in ("rendering needs an OpenGL", "libosmesa6", "libegl1")), done.stderr
+    printed, _ = run_python("-c", _WITHOUT_OPENGL)
+    assert all(x in printed for x in ("rendering needs an OpenGL", "libosmesa6", "libegl1"))

@@ -8,7 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.scene import SceneError, SceneWarning, load_scene
+from mjxgrad.scene import SceneError, SceneWarning, load, load_scene
 
 PENDULUM = """
 <mujoco>
@@ -198,6 +198,27 @@ def test_excluded_pairs_and_unused_settings_are_no_obstacle():
     # An ellipsoid fluid shape without fluid, a group without actuators.
     load_scene(_fill(PENDULUM, geom="fluidshape='ellipsoid'"))
     load_scene(_fill(PENDULUM, option="actuatorgroupdisable='2'", rest=_actuator("group='1'")))
+
+
+def _balls(count):
+    balls = "".join(f'<body pos="{i} 0 0"><freejoint/><geom size=".1"/></body>' for i in range(count))
+    return f"<mujoco><worldbody>{balls}</worldbody></mujoco>"
+
+
+def test_too_many_pairs_are_refused():
+    with pytest.raises(SceneError, match=r"at most 20000 pairs .* got more"):
+        load_scene(_balls(300), engine="mjx")
+    with pytest.warns(SceneWarning, match="C MuJoCo steps it: .*got more"):
+        assert load_scene(_balls(300)).engine == "mujoco"
+
+
+def test_pairs_that_are_excluded_do_not_count(monkeypatch):
+    monkeypatch.setattr(load, "MOST_PAIRS", 2)
+    with pytest.raises(SceneError, match=r"at most 2 pairs .* got more"):
+        load_scene(_balls(3), engine="mjx")
+    apart = "</worldbody><contact><exclude body1='one' body2='other'/></contact>"
+    named = _balls(3).replace("<body", "<body name='one'", 1).replace("<body p", "<body name='other' p", 1)
+    assert len(load_scene(named.replace("</worldbody>", apart)).pairs) == 2
 
 
 @pytest.mark.slow

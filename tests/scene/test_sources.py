@@ -1,8 +1,5 @@
 """What `load_scene` takes, and what it says when it cannot."""
 
-import subprocess
-import sys
-
 import jax
 import mujoco
 import numpy as np
@@ -81,21 +78,14 @@ def test_several_unsupported_features_are_named_at_once():
 
 
 def test_float32_asks_for_no_more_than_it_resolves():
-    # Precision is a global switch of JAX, so the other one needs a process of its own.
-    code = (
-        "import sys, mjxgrad.scene as s\n"
-        f"scene = s.load_scene('''{FALLING}''')\n"
-        f"kept = s.load_scene('''{FALLING}''', keep_everything=True)\n"
-        "print(scene.data.qpos.dtype, scene.model.opt.tolerance, kept.model.opt.tolerance)\n"
-        "print([c.what for c in scene.conversions], scene.to_mujoco().opt.timestep == 0.002)"
-    )
-    command = [sys.executable, "-c", "import jax; jax.config.update('jax_enable_x64', False)\n" + code]
-    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")
-    dtype, raised, kept = output[0].split()
-    assert dtype == "float32"
-    np.testing.assert_allclose([float(raised), float(kept)], [1e-6, 1e-8], rtol=1e-6)
+    with jax.enable_x64(False):
+        scene, kept = load_scene(FALLING), load_scene(FALLING, keep_everything=True)
+        timestep = scene.to_mujoco().opt.timestep
+    assert scene.data.qpos.dtype == np.float32
+    np.testing.assert_allclose([scene.model.opt.tolerance, kept.model.opt.tolerance], [1e-6, 1e-8], rtol=1e-6)
+    assert [conversion.what for conversion in scene.conversions] == ["tolerance"]
     # Digits that float32 has rounded, and nobody has changed, come back as they were.
-    assert output[1] == "['tolerance'] True"
+    assert timestep == 0.002
 
 
 def test_what_mujoco_warns_of_is_a_warning_and_no_file(tmp_path, monkeypatch, capfd):

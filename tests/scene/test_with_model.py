@@ -98,6 +98,17 @@ def test_sensors_and_sites_are_read_by_name_as_in_c():
             read(scene.model, scene.data, "nose")
 
 
+def test_a_rangefinder_sees_a_scene_without_materials():
+    scene = mg.load_scene("""<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="0 0 .5">
+      <freejoint/><geom size=".1"/><site name="down" pos="0 0 -.1" zaxis="0 .1 -1"/></body></worldbody>
+      <sensor><rangefinder name="height" site="down"/></sensor></mujoco>""")
+    data = mujoco.MjData(scene.mj_model)
+    mujoco.mj_forward(scene.mj_model, data)
+    found = jax.jit(mg.forward)(scene.model, scene.data).sensordata
+    np.testing.assert_allclose(found, data.sensordata, rtol=1e-12)
+    assert found[0] > 0.4
+
+
 def test_c_mujoco_finds_contacts_of_geoms_that_have_moved_and_grown():
     """Balls moved out through the floor, on a body whose inertia is turned, touch as if compiled there."""
 

@@ -45,7 +45,7 @@ def test_one_kernel_does_what_the_operations_do(groups):
     layout, (mass, jacobian, row_hessian, vector) = _problem(groups)
     kernel = functools.partial(hessian.in_one_kernel, interpret=jax.default_backend() != "gpu")
     found, diagonal = jax.jit(functools.partial(kernel, layout))(mass, jacobian, row_hessian, vector)
-    matrix = jacobian.gram(mass, layout, row_hessian)
+    matrix = np.asarray(jax.jit(lambda *given: given[0].gram(given[1], layout, given[2]))(jacobian, mass, row_hessian))
     expected = np.linalg.solve(np.moveaxis(matrix, -1, 0), vector.T[..., None])[..., 0].T
     np.testing.assert_allclose(found, expected, rtol=1e-9)  # conditions up to 1e4
     np.testing.assert_allclose(diagonal, matrix[np.arange(_NV), np.arange(_NV)], rtol=1e-13)
@@ -64,7 +64,9 @@ def test_one_kernel_mends_what_the_operations_mend():
     expected = jax.jit(lambda *args: hessian.solve_regularised(args[0], args[1], layout, args[2], args[3]))(
         mass, jacobian, row_hessian, vector
     )
-    unmended, _ = hessian.solve(mass, jacobian, layout, row_hessian, vector)
+    unmended, _ = jax.jit(lambda *args: hessian.solve(args[0], args[1], layout, args[2], args[3]))(
+        mass, jacobian, row_hessian, vector
+    )
     assert not np.isfinite(unmended[:, 0]).all()
     assert np.isfinite(expected).all()
     # A condition of 1e4 in single precision.

@@ -88,8 +88,11 @@ def test_rows_as_a_map_are_their_matrix_and_its_transpose(rows, random):
         np.testing.assert_allclose(one, expected, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("most_groups", [24, 0], ids=["by groups", "in one matrix"])
-@pytest.mark.parametrize("batch", [(), (3,)], ids=["one", "batch"])
+@pytest.mark.parametrize(
+    ("most_groups", "batch"),
+    [(24, ()), (24, (3,)), (0, (3,))],
+    ids=["by groups", "batch by groups", "batch in one matrix"],
+)
 def test_sparse_rows_are_the_matrix_without_its_zeros(rows, random, batch, most_groups, monkeypatch):
     """J x, Jᵀ f and M + Jᵀ S J of the rows that act, for one state and with a trailing batch."""
     monkeypatch.setattr("mjxgrad.solver.hessian._MOST_GROUPS", most_groups)

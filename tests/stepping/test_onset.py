@@ -13,7 +13,6 @@ import mjxgrad as mg
 from experiments.sawtooth import case
 from mjxgrad.stepping.onset import _split
 from mjxgrad.stepping.rows import Block
-from mjxgrad.tasks import wall_softness
 from tests.scenes import ASSETS
 
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
@@ -124,25 +123,19 @@ def test_no_scene_of_gymnasium_has_jumps(name):
 
 
 def test_the_mean_of_the_derivative_is_the_difference_of_the_outcome():
-    """The fundamental theorem, over a tooth and a half; without the onset the jump is missing."""
+    """The fundamental theorem, over a tooth and a half, each of which is a jump without the onset."""
     outcome, num_steps = _outcome("ball")
     places = np.linspace(0.0, 0.3, 513)
 
-    def both(kind):
-        def value(place):
-            return outcome(place[None], jnp.int32(num_steps), kind)[0]
+    def value(place):
+        return outcome(place[None], jnp.int32(num_steps), "continuous")[0]
 
-        return jax.jit(jax.vmap(lambda place: jax.jvp(value, (place,), (jnp.ones(()),))))(jnp.asarray(places))
-
-    def missing(kind):
-        values, slopes = map(np.asarray, both(kind))
-        change = values[-1] - values[0]
-        mean = (0.5 * (slopes[:-1] + slopes[1:]) * np.diff(places)[:, None]).sum(axis=0)
-        return np.abs(mean - change).max() / np.abs(change).max()
-
+    along = jax.jit(jax.vmap(lambda place: jax.jvp(value, (place,), (jnp.ones(()),))))
+    values, slopes = map(np.asarray, along(jnp.asarray(places)))
+    change = values[-1] - values[0]
+    mean = (0.5 * (slopes[:-1] + slopes[1:]) * np.diff(places)[:, None]).sum(axis=0)
     # Kinks between samples: a part of 1 / 512 of the interval each, with derivatives of some times the mean.
-    assert missing("continuous") < 0.01
-    assert missing("mujoco") > 0.1
+    assert np.abs(mean - change).max() < 0.01 * np.abs(change).max()
 
 
 @pytest.mark.slow
@@ -217,36 +210,6 @@ def test_free_flight_and_deep_contact_are_mujocos():
     )  # two programs, whose sums XLA may order otherwise
 
 
-@pytest.mark.slow
-def test_several_contacts_share_the_step_and_none_jumps():
-    """A beam that lands on both ends and two balls beside it, each at another time of the same step."""
-    beam = """
-    <mujoco>
-      <option timestep="0.002"/>
-      <worldbody>
-        <geom type="plane" size="5 5 .1"/>
-        <body><freejoint/><geom type="capsule" size=".05 .2" euler="0 90 0"/>
-          <body pos="0 .3 0"><joint type="slide" axis="0 0 1" range="-.001 1" limited="true"/><geom size=".05"/></body></body>
-      </worldbody>
-    </mujoco>
-    """
-    scene = _scene(beam)
-
-    def outcome(places, kind):
-        def at(place):
-            tilt = jnp.array([jnp.cos(0.002 * place), 0, jnp.sin(0.002 * place), 0])
-            qpos = scene.data.qpos.at[2].set(0.0505 + 0.002 * place).at[3:7].set(tilt).at[7].set(0.002 - 0.004 * place)
-            qvel = jnp.array([0.5, 0, -1.0, 0, 0.3, 0, -1.0])
-
-            return _end(scene, scene.data.replace(qpos=qpos, qvel=qvel), 6, kind)
-
-        return jax.vmap(at)(places)
-
-    compiled = jax.jit(outcome, static_argnums=1)
-    assert _largest_jump(lambda places: compiled(places, "continuous")) < _ROUNDING
-    assert _largest_jump(lambda places: compiled(places, "mujoco")) > 1e-5
-
-
 _WALL = """
 <mujoco>
   <option timestep="0.002" gravity="0 0 0" cone="{cone}"/>
@@ -299,20 +262,6 @@ def test_through_a_soft_wall_both_sides_push_for_their_share(cone, condim, wall,
     assert (np.ptp(smooth, axis=0) < 0.1 * size)[has_teeth].all()
     # A tenth of the teeth: the mean of a sawtooth is its centre only where it is linear.
     assert (np.abs(smooth.mean(axis=0) - teeth.mean(axis=0)) < 0.1 * size)[has_teeth].all()
-
-
-@pytest.mark.slow
-def test_a_throw_through_the_softened_wall_has_no_teeth():
-    task = mg.tasks.ball_wall().with_softness(wall_softness(300.0))
-
-    def costs(task):
-        return np.asarray(jax.jit(jax.vmap(lambda angle: task.cost(angle[None])))(jnp.linspace(0.32, 0.57, 400)))
-
-    def roughness(values):
-        place = np.linspace(-1, 1, len(values))
-        return (values - np.polyval(np.polyfit(place, values, 5), place)).std()
-
-    assert roughness(costs(task.with_contact(mg.Onset()))) < 0.05 * roughness(costs(task))
 
 
 _PUSHED = """
@@ -381,7 +330,7 @@ def test_a_light_foot_that_a_strong_motor_presses_down_does_not_chatter():
 
     places = jnp.linspace(-1, 1, 128)
     values, derivatives = jax.jit(jax.vmap(jax.value_and_grad(lambda x: turning(x, mg.Onset()))))(places)
-    mujocos = jax.jit(jax.vmap(lambda x: turning(x, mg.Discrete())))(places)
+    mujocos = jax.jit(jax.vmap(lambda x: turning(x, mg.Discrete("mujoco"))))(places)
     slope = (values[-1] - values[0]) / 2
     assert np.abs(derivatives).max() < 15 * np.abs(slope)
     assert np.abs(derivatives.mean() - slope) < 3 * derivatives.std() / np.sqrt(128)
@@ -403,22 +352,6 @@ def test_a_derivative_that_has_grown_beyond_belief_is_flagged():
     assert not flight.explodes
     assert 0.5 < flight.growth < 2
     assert not mg.rollout(free, mg.initial_state(free), horizon=20).explodes
-
-
-@pytest.mark.slow
-def test_the_width_can_be_swept_and_differentiated():
-    scene = _scene(_BALL.format(cone="pyramidal", condim=3))
-    start = scene.data.replace(qpos=scene.data.qpos.at[2].set(5.00001), qvel=jnp.array([0.0, 0, -1e-3, 0, 0, 0]))
-
-    def after(width):
-        return mg.step(scene.model, start, contact=mg.Onset(width)).qvel[2]
-
-    widths = jnp.array([0.05, 0.1, 0.4])
-    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(after)))(widths)
-    assert len(np.unique(values)) == 3
-    # Longer steps than rounding asks for: a solve of tolerance 1e-13 is known to some 1e-13 m/s.
-    ends = jax.jit(jax.vmap(after))(jnp.concatenate([widths + 1e-4, widths - 1e-4])).reshape(2, 3)
-    np.testing.assert_allclose(slopes, (ends[0] - ends[1]) / 2e-4, rtol=1e-3)
 
 
 def test_a_weight_that_rounds_to_one_keeps_its_derivative():

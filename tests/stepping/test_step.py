@@ -62,10 +62,7 @@ def test_all_kinds_of_rows_move_as_in_c(cone, integrator):
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 @_SLOW
 def test_rows_are_those_of_mjx(cone):
-    """Every field of every row; a few units of rounding of numbers up to 1e4.
-
-    But what the 12 rows of connect and weld ask for: MJX lacks the acceleration of turning bodies that C has.
-    """
+    """Every field but what connect and weld ask for, where MJX lacks the acceleration of turning bodies; rounding of 1e4."""
     model, data = zoo(cone, welded=True)
     mjx_model = mjx.put_model(model)
     ready = jax.jit(lambda d: mjx.fwd_position(mjx_model, d))(mjx.put_data(model, data))
@@ -87,19 +84,6 @@ def test_solve_replaces_the_one_of_mjx():
     # MJX stops where the cost improves by less than 1e-13 of its scale, so its forces are known to about 1e-6.
     np.testing.assert_allclose(ours.qacc, ready.qacc, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(ours._impl.efc_force, ready._impl.efc_force, rtol=1e-5, atol=1e-5)
-
-
-@_SLOW
-def test_solution_is_a_minimum_and_cold_start_finds_the_same():
-    """The gradient of the cost vanishes; without warm start the answer does not move."""
-    model, data = zoo("elliptic")
-    mjx_model, mjx_data = mjx.put_model(model), mjx.put_data(model, data)
-    warm = jax.jit(lambda d: mg.forward(mjx_model, d))(mjx_data)
-    residual = warm._impl.M @ warm.qacc - warm.qfrc_smooth - warm.qfrc_constraint
-    np.testing.assert_allclose(residual, 0, atol=1e-8)  # forces of order 10 N, solved to 1e-13 of the cost
-    flags = mjx_model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_WARMSTART
-    cold = jax.jit(lambda d: mg.forward(mjx_model.tree_replace({"opt.disableflags": flags}), d))(mjx_data)
-    np.testing.assert_allclose(cold.qacc, warm.qacc, atol=1e-8)
 
 
 def _directional(model, data, steps):
@@ -187,10 +171,9 @@ def test_parameters_of_the_model_have_their_derivative(field):
         final, _ = jax.lax.scan(lambda d, _: (_state(mg.step(changed, _full(data, d))), None), _state(data), length=20)
         return jnp.dot(jnp.concatenate(final), jnp.array([1.0, -2.0, 0.5, 3.0, 0.0, 0.0]))
 
-    slope = jax.jit(jax.grad(outcome))(1.0)
-    ends = jax.jit(jax.vmap(outcome))(jnp.array([1 + 1e-6, 1 - 1e-6]))
-    assert jnp.abs(slope) > 1e-6
-    np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-6, rtol=1e-5)
+    ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(outcome)))(jnp.array([1 + 1e-6, 1.0, 1 - 1e-6]))
+    assert jnp.abs(slopes[1]) > 1e-6
+    np.testing.assert_allclose(slopes[1], (ends[0] - ends[2]) / 2e-6, rtol=1e-5)
 
 
 def _state(data):
@@ -219,21 +202,6 @@ def test_second_derivatives_nest():
     assert jnp.sum(jnp.abs(hessian) > 1e-4) > 5
     np.testing.assert_allclose(hessian, truth, rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(hessian, jax.jit(jax.jacfwd(jax.jacfwd(outcome)))(point), rtol=1e-6, atol=1e-10)
-
-
-@_SLOW
-def test_a_batch_is_its_members():
-    """The solver works on batches in another layout: the same numbers to rounding."""
-    model, data = zoo("elliptic")
-    mjx_model, mjx_data = mjx.put_model(model), mjx.put_data(model, data)
-    velocities = mjx_data.qvel * jnp.linspace(-1, 1, 3)[:, None]
-
-    def outcome(v):
-        return mg.step(mjx_model, mjx_data.replace(qvel=v)).qvel
-
-    together = jax.jit(jax.vmap(outcome))(velocities)
-    alone = jnp.stack([jax.jit(outcome)(v) for v in velocities])
-    np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-9)
 
 
 @_SLOW

@@ -33,26 +33,24 @@ def near(confidence: float, slack: float = 0.0):
     return pytest.approx(confidence, abs=4 * np.sqrt(confidence * (1 - confidence) / REPEATS) + slack)
 
 
+def measured(samples):
+    """Means, their standard errors and the number of samples."""
+    count = samples.shape[1]
+    return samples.mean(1), samples.std(1, ddof=1) / np.sqrt(count), count
+
+
 def test_an_interval_of_a_bias_covers_with_a_reference_as_uncertain_as_the_mean():
     """Mean of 5 samples of deviation 2, reference of 8 of deviation 3, bias 0.7; unequal variances are Welch's case."""
     rng = np.random.default_rng(0)
     samples, others = rng.normal(1.7, 2.0, (REPEATS, 5)), rng.normal(1.0, 3.0, (REPEATS, 8))
-    low, high = bias_interval(
-        samples.mean(1),
-        samples.std(1, ddof=1) / np.sqrt(5),
-        5,
-        others.mean(1),
-        others.std(1, ddof=1) / np.sqrt(8),
-        8,
-        0.9,
-    )
+    low, high = bias_interval(*measured(samples), *measured(others), 0.9)
     assert share(low, high, 0.7) == near(0.9, 0.005)
 
 
 def test_an_interval_of_a_bias_to_a_closed_form_is_student_s():
     rng = np.random.default_rng(1)
     samples = rng.normal(1.7, 2.0, (REPEATS, 4))
-    low, high = bias_interval(samples.mean(1), samples.std(1, ddof=1) / 2, 4, 1.0, confidence=0.9)
+    low, high = bias_interval(*measured(samples), 1.0, confidence=0.9)
     assert share(low, high, 0.7) == near(0.9)
     np.testing.assert_array_equal(bias_interval(2.0, 0.0, 9, 1.5), [0.5, 0.5])
 
@@ -118,15 +116,8 @@ def test_a_bias_shows_in_the_error_and_not_in_the_variance():
     """A step on a parabola: first order converges to 2θ and misses the density of the noise at the step."""
     objective = parameter_noise(lambda x: step(x) + x[0] ** 2, STDDEV, dim=1)
     missed = step_gradient(POINT)
-    table = compare(
-        {"first": first_order},
-        objective,
-        jnp.array([POINT]),
-        jax.random.key(1),
-        budget=40,
-        reference=[missed + 2 * POINT],
-        num_repeats=300,
-    )
+    given = {"budget": 40, "reference": [missed + 2 * POINT], "num_repeats": 300}
+    table = compare({"first": first_order}, objective, jnp.array([POINT]), jax.random.key(1), **given)
     # Var 2w = 4σ².
     assert table.variance[0] == pytest.approx(4 * STDDEV**2 / 40, rel=0.3)
     low, high = table.bias_interval[:, 0, 0]
@@ -139,15 +130,8 @@ def test_a_bias_shows_in_the_error_and_not_in_the_variance():
 def test_estimates_that_are_not_finite_are_counted_and_left_out(seed):
     """Two samples, each infinite beyond one deviation (16 %): a few estimates have fewer than two and are NaN."""
     objective = parameter_noise(lambda x: jnp.where(x[0] > STDDEV, jnp.inf, x[0] ** 2), STDDEV, dim=1)
-    table = compare(
-        {"first": first_order},
-        objective,
-        jnp.zeros(1),
-        jax.random.key(seed),
-        budget=2,
-        reference=[0.0],
-        num_repeats=400,
-    )
+    given = {"budget": 2, "reference": [0.0], "num_repeats": 400}
+    table = compare({"first": first_order}, objective, jnp.zeros(1), jax.random.key(seed), **given)
     expected = 400 * 0.8413447**2
     assert abs(table.num_finite[0] - expected) < 4 * np.sqrt(expected * 0.3)
     assert np.isfinite([table.rmse[0], table.variance[0], table.mean[0, 0]]).all()
