@@ -52,6 +52,12 @@ def instance(name: str, value: Any, kind: type, wanted: str) -> None:
         raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
 
 
+def function(name: str, value: Any) -> None:
+    """Refuse what is neither a function nor None."""
+    if value is not None and not callable(value):
+        raise ValueError(f"{name} must be a function, got {value!r:.80}")
+
+
 def form(value: Any) -> str:
     """Return the shape of numbers, or the type of anything else, for messages."""
     return f"shape {jnp.shape(value)}" if eqx.is_array_like(value) else type(value).__name__

@@ -78,12 +78,21 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
     The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
-    interruption. Once it measures derivatives an interrupted `check` prints the verdict so far.
+    interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
-    # SIGTERM is handled like Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    interruptions: list[int] = []
+
+    def interrupt(number: int, _: Any) -> None:
+        interruptions.append(number)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # SIGTERM is handled like Ctrl-C
+        signal.signal(number, interrupt)
     try:
-        return app(arguments, exit_on_error=False, print_error=False) or 0
+        status = app(arguments, exit_on_error=False, print_error=False) or 0
+        if interruptions:  # the library has returned what was measured
+            raise KeyboardInterrupt
+        return status
     except KeyboardInterrupt:
         _say("interrupted")
         return 130
@@ -124,7 +133,7 @@ def check(
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; or height:body and others, see `sweep`.
         html: write a page to this file.
-        quick: only fast checks, in seconds: contact, time step, parts without effect.
+        quick: only fast checks, in seconds: contact, time step, parts without effect, one value and derivative of the cost.
         budget: duration in s once the scene is loaded; the report names measurements that are left out.
         seed: seed of all random numbers.
     """

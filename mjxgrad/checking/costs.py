@@ -1,8 +1,10 @@
 """Costs by name: functions of files and modules, and height, speed, uprightness and reach of bodies."""
 
+import functools
 import importlib
 import runpy
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -46,7 +48,10 @@ def named_cost(scene: Scene, name: str) -> Cost:
 
 
 def _function(name: str) -> Callable[..., Any]:
-    """Return a function by file.py:function or module:function, the module also in the current folder."""
+    """Return a function by file.py:function or module:function, the module also in the current folder.
+
+    An error in the function becomes a sentence that names the line.
+    """
     source, _, function = name.rpartition(":")
     if source.endswith(".py") and not Path(source).is_file():
         raise ValueError(f"cost: there is no file {source}")
@@ -59,7 +64,18 @@ def _function(name: str) -> Callable[..., Any]:
     if not callable(names.get(function)):
         there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
         raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
-    return names[function]
+    cost = names[function]
+
+    @functools.wraps(cost)
+    def called(trajectory: Trajectory) -> Any:
+        try:
+            return cost(trajectory)
+        except Exception as error:
+            lines = [one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename.endswith(source)]
+            where = f" in line {lines[-1]}" if lines else ""
+            raise ValueError(f"cost: {name} raised {type(error).__name__}{where}: {error}") from error
+
+    return called
 
 
 def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:

@@ -16,7 +16,7 @@ from mjxgrad.scene import Scene
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
-    "not_measured", "left_out", "slope", "order", "note",
+    "cost", "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
@@ -282,6 +282,7 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
     words = {
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
+        "cost": "the cost has no derivative",
         "no_contact": "nothing touches",
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",

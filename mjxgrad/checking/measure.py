@@ -176,7 +176,7 @@ def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | f
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
     still = np.zeros(motions.qvel.shape[2])
     direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
-    states = _repeated(motions.state(0, 0), mover.size)
+    states = repeated(motions.state(0, 0), mover.size)
     controls = np.repeat(motions.controls[:1, :_TRIED_STEPS], mover.size, axis=0)
     mover.move("slope", states, controls, direction, [_TRIED_STEPS])
     affordable = seconds / (_NUM_BATCHES * mover.step_seconds)
@@ -184,7 +184,8 @@ def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | f
     return sorted({max(1, round(num_steps * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
 
 
-def _repeated(state: State, size: int) -> State:
+def repeated(state: State, size: int) -> State:
+    """Return a batch of one state."""
     return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], size, axis=0), state)
 
 
@@ -223,7 +224,7 @@ class _Probe:
         state, controls = self._at(motion, begin)
 
         def along(kind: Kind, places: Float[np.ndarray, " motions"]) -> Moved:
-            states = _repeated(state, self.mover.size)
+            states = repeated(state, self.mover.size)
             states.qpos[:] = moved(self.scene.mj_model, states.qpos, direction.positions, places)
             states.qvel[:] += places[:, None] * direction.velocities
             varied = controls + places[:, None, None] * direction.controls
@@ -281,7 +282,7 @@ class _Probe:
         wiggle = smooth(rng, steps, len(half), seconds) if has_controls else rng.normal(size=(1, still.size))
         along = wiggle / np.sqrt((wiggle**2).sum())
         noise = stddev * rng.normal(size=(size, *along.shape))
-        states = _repeated(state, size)
+        states = repeated(state, size)
         if has_controls:
             direction, noisy = Direction(still, still, along * half), controls + noise * half
         else:

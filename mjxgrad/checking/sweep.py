@@ -13,7 +13,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
-from mjxgrad._arrays import is_known, whole
+from mjxgrad._arrays import function, is_known, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
@@ -197,6 +197,8 @@ def sweep(
 ) -> Sweep:
     """Measure bias and variance of first, zeroth and α-order gradients over contact stiffness, in a scene of one's own.
 
+    Ctrl-C ends it with the stiffnesses measured so far.
+
     Args:
         source: an MJCF file, or another source for `load_scene`.
         cost: as in `scene_task`.
@@ -216,6 +218,7 @@ def sweep(
     if not 0 < noise < np.inf:
         raise ValueError(f"noise must be positive and finite, got {noise}")
     whole("seed", seed, 0)
+    function("log", log)
     scene = load_scene(source)
     task = scene_task(scene, cost, seed=seed, **task_settings)
     knob = Knob(task, noise, seed)
@@ -234,7 +237,8 @@ def sweep(
     question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
     question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
-    ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
-    ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
-    question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
+    if row < len(result.cost):  # not left out by an interruption
+        ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
+        ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
+        question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
     return Sweep(scene.name, question, knob.own, result)

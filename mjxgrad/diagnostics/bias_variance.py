@@ -24,7 +24,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import function, whole
 from mjxgrad._programs import compile_once
 from mjxgrad._text import Printed, aligned, format_number
 from mjxgrad.contact import Softness
@@ -127,6 +127,7 @@ class BiasVariance(eqx.Module, Printed):
         landscape: the cost along the parameter at every softness; None unless there is a single parameter with noise.
         warnings: the warnings of the scene at each softness, such as a time step that is too long; often empty.
         confidence: coverage of every interval.
+        num_left_out: number of softnesses that an interruption left out, the last ones.
     """
 
     softness: PyTree
@@ -141,6 +142,7 @@ class BiasVariance(eqx.Module, Printed):
     landscape: Landscape | None
     warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
+    num_left_out: int = eqx.field(static=True, default=0)
 
     @property
     def bias(self) -> Float[Array, "softness points dim"]:
@@ -224,7 +226,9 @@ class BiasVariance(eqx.Module, Printed):
             f"Truth: {what} of the cost under noise, from separate rollouts; ± is half a {self.confidence:.0%} interval. "
             "Variance: of one rollout. *: a bias that is significant over the whole table."
         )
-        return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1]]
+        cut = [f"Interrupted: {self.num_left_out} of {self.num_left_out + len(self.cost)} are left out."]
+        too_stiff = [f"!: the time step is too long for it. {text}." for text in self._too_stiff if text]
+        return [told, *too_stiff[:1], *cut * bool(self.num_left_out)]
 
     @property
     def _too_stiff(self) -> list[str]:
@@ -276,8 +280,8 @@ def bias_variance(
     r"""Measure bias and variance of first, zeroth and α-order gradient estimates at every softness and point.
 
     All softnesses share the same noise, which makes differences between them visible. One program is compiled, at the first
-    softness. The loop over softnesses runs on the host, where it can report progress. Samples are kept for the bootstrap:
-    memory grows with points × `num_samples` × dim.
+    softness. The loop over softnesses runs on the host, where it can report progress. Ctrl-C ends it with the softnesses
+    measured so far. Samples are kept for the bootstrap: memory grows with points × `num_samples` × dim.
 
     Args:
         objective_of_softness: function from one softness to the objective; traceable.
@@ -307,6 +311,7 @@ def bias_variance(
         )
     params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
+    function("progress", progress)
     stacked, count = _stacked(softness)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     objective, told = _warned(objective_of_softness, each)
@@ -331,12 +336,20 @@ def bias_variance(
             measured["reference_error"] = jnp.sqrt(sum(error**2 for _, error in runs)) / len(runs)
         return measured, _variance_intervals(samples, batches, confidence)
 
-    rows = []
     with ThreadPoolExecutor(_WORKERS) as pool:
-        for done in pool.map(row, each):
-            rows.append(done)
-            if progress is not None:
-                progress(len(rows), count)
+        futures = [pool.submit(row, one) for one in each]
+        try:
+            for done, future in enumerate(futures, 1):
+                future.result()
+                if progress is not None:
+                    progress(done, count)
+        except KeyboardInterrupt:
+            pool.shutdown(cancel_futures=True)  # those that have begun are completed
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    rows = [future.result() for future in futures if not future.cancelled()]
+    stacked = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
     ends = np.stack([row[1] for row in rows], axis=2)
     return BiasVariance(
@@ -344,8 +357,9 @@ def bias_variance(
         softness=stacked,
         params=params,
         variance_intervals=dict(zip(ESTIMATES, ends, strict=False)),
-        warnings=told,
+        warnings=told[: len(rows)],
         confidence=confidence,
+        num_left_out=count - len(rows),
     )
 
 

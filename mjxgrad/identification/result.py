@@ -42,6 +42,7 @@ class Stopped(enum.Enum):
     CONVERGED = "converged"
     STALLED = "stalled"
     STEPS = "max_steps reached"
+    INTERRUPTED = "interrupted"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Identification(Printed):
         """The answer, in at most 15 words."""
         lost = int(np.isinf(np.concatenate([np.ravel(half) for half in self.half_width.values()])).sum())
         if self.stopped is not Stopped.CONVERGED:
-            ended = "stalled" if self.stopped is Stopped.STALLED else "was cut short"
+            ended = {Stopped.STALLED: "stalled", Stopped.STEPS: "was cut short"}.get(self.stopped, "was interrupted")
             return f"The search {ended}: do not trust the values."
         count = len(self.names)
         found = f"{count - lost} of {count} numbers found" if lost else f"All {count} found" if count > 1 else "Found"

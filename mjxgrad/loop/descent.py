@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import function, whole
 from mjxgrad._programs import compile_once, is_traced
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
@@ -54,6 +54,7 @@ class RunOptions(eqx.Module):
     def __check_init__(self):
         for name in ("num_steps", "evaluate_every", "patience"):
             whole(name, getattr(self, name))
+        function("evaluate", self.evaluate)
 
 
 class Carry(eqx.Module):

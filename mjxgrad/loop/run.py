@@ -18,6 +18,7 @@ import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
+from mjxgrad._arrays import function
 from mjxgrad._programs import compile_once
 from mjxgrad.batched.device import all_devices
 from mjxgrad.loop import checkpoint as checkpoints
@@ -126,6 +127,7 @@ def run(
     Raises:
         ValueError: if the checkpoint has no folder, is damaged, or from a run with another program, arrays or start.
     """
+    function("log", log)
     if checkpoint is not None and not checkpoint.parent.is_dir():
         raise ValueError(
             f"checkpoint must be in a folder that exists, got {checkpoint}; make {checkpoint.parent} first"
