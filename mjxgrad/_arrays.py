@@ -1,5 +1,6 @@
 """Known values of traced arrays, and checks of arguments."""
 
+import inspect
 import operator
 from typing import Any
 
@@ -9,9 +10,28 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def as_float(value: Any) -> Any:
+def as_float(value: Any, name: str = "softness") -> Any:
     """Return numbers as an array of floats, also integers (10000 is a natural stiffness); None stays None."""
-    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
+    return None if value is None else real(name, value, jnp.result_type(float))
+
+
+def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
+    """Return real numbers as an array; refuse text, objects and ragged lists."""
+    try:
+        kind = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
+    except jax.errors.TracerArrayConversionError:  # a list of traced numbers
+        kind = jnp.asarray(value).dtype
+    except (TypeError, ValueError):
+        kind = np.dtype(object)
+    if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
+        raise ValueError(f"{name} must be real numbers, got {shown(value) if kind.kind == 'O' else kind}")
+    return jnp.asarray(value, dtype)
+
+
+def shown(value: Any) -> str:
+    """Return a value for messages: what fits into a line, else its type."""
+    text = repr(value)
+    return text if len(text) <= 80 and "\n" not in text else type(value).__name__
 
 
 def known(values: Any) -> np.ndarray | None:
@@ -39,6 +59,8 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
         raise ValueError(f"{name} must be known before anything is compiled, got a traced value; make it static")
     try:
         number = operator.index(value)
+        if isinstance(value, bool):
+            raise TypeError
     except TypeError:
         raise ValueError(f"{name} must be a whole number, got {value!r}") from None
     if least is not None and number < least:
@@ -46,16 +68,22 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
     return number
 
 
-def instance(name: str, value: Any, kind: type, wanted: str) -> None:
+def instance(name: str, value: Any, kind: Any, wanted: str) -> None:
     """Refuse a value of another type."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
 
 
-def function(name: str, value: Any) -> None:
-    """Refuse what is neither a function nor None."""
-    if value is not None and not callable(value):
-        raise ValueError(f"{name} must be a function, got {value!r:.80}")
+def function(name: str, value: Any, *arguments: str) -> None:
+    """Refuse what is neither a function of these arguments nor None."""
+    try:
+        if value is not None:
+            inspect.signature(value).bind(*arguments)
+    except TypeError as error:
+        wanted = f"{name} must be a function of {' and '.join(arguments)}"
+        raise ValueError(f"{wanted}, got {shown(value)}: {error}") from None
+    except ValueError:  # a function of C without a signature
+        return
 
 
 def form(value: Any) -> str:

@@ -1,40 +1,26 @@
-"""Import JAX and MuJoCo, whose own answer to a wrong variable of the environment is a traceback."""
+"""JAX and MuJoCo, imported here first: their own answer to a wrong variable of the environment is a traceback."""
 
 import importlib
 import os
 import sys
 from pathlib import Path
 
-
-def _import_jax() -> None:
-    """Refuse a value that JAX refuses; a command line ends with the sentence alone.
-
-    Raises:
-        ValueError: with the name of the variable.
-    """
-    try:
-        importlib.import_module("jax")
-    except ValueError as error:
-        told = f"JAX refuses the environment: {error}; JAX's switches are true or false, 1 or 0"
-        if Path(sys.argv[0]).name in ("-m", "mjxgrad"):
-            print(told, file=sys.stderr)
-            sys.exit(2)
+try:
+    importlib.import_module("jax")
+except ValueError as error:
+    told = f"JAX refuses the environment: {error}; JAX's switches are true or false, 1 or 0"
+    if Path(sys.argv[0]).name not in ("-m", "mjxgrad"):
         raise ValueError(told) from None
-
-
-def _import_mujoco() -> None:
-    """Import MuJoCo without OpenGL where its choice, MUJOCO_GL, fails; `render` tells of it where OpenGL is needed."""
-    try:
-        importlib.import_module("mujoco")
-    except Exception:  # MuJoCo and PyOpenGL raise errors without a common class
-        if (chosen := os.environ.get("MUJOCO_GL")) is None:
-            raise
-        os.environ["MUJOCO_GL"] = "off"
-        try:
-            importlib.import_module("mujoco")
-        finally:
-            os.environ["MUJOCO_GL"] = chosen
-
-
-_import_jax()
-_import_mujoco()
+    print(told, file=sys.stderr)  # the command line
+    sys.exit(2)
+try:
+    importlib.import_module("mujoco")
+except Exception:  # MuJoCo and PyOpenGL raise errors without a common class
+    # Where an OpenGL that is chosen fails, MuJoCo is imported without any, and `render` tells of it when it is needed.
+    chosen = os.environ.get("MUJOCO_GL", "off")
+    os.environ["MUJOCO_GL"] = "off"
+    importlib.import_module("mujoco")
+    os.environ["MUJOCO_GL"] = chosen
+    # The first attempt's modules are not imported again, and would not be found as attributes.
+    for name in [name for name in sys.modules if name.startswith("mujoco.") and name.count(".") == 1]:
+        setattr(sys.modules["mujoco"], name.partition(".")[2], sys.modules[name])

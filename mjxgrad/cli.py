@@ -62,6 +62,10 @@ mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 '''
 
 
+# cyclopts alone would round 1.5.
+Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]
+
+
 class CommandError(Exception):
     """A request that cannot be carried out; the message is a sentence for the user."""
 
@@ -125,7 +129,7 @@ def check(
     html: Path | None = None,
     quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     budget: float = 12.0,
-    seed: int = 0,
+    seed: Whole = 0,
 ) -> int:
     """Check whether and how a scene can be differentiated; the exit status is 1 where there are faults.
 
@@ -153,13 +157,13 @@ def sweep(
     *,
     cost: str | None = None,
     start: str | None = None,
-    horizon: int | None = None,
+    horizon: Whole | None = None,
     stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
     noise: float = 0.1,
-    samples: int = 256,
+    samples: Whole = 256,
     gradient: Literal["slope", "discrete"] = "slope",
     engine: Literal["mjx", "mujoco"] | None = None,
-    seed: int = 0,
+    seed: Whole = 0,
     html: Path = Path("sweep.html"),
 ) -> None:
     """Measure bias and variance of first, zeroth and α-order gradients of a scene, over contact stiffness.
@@ -231,9 +235,14 @@ def identify(
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     loaded = mg.load_scene(_existing(scene), keep_everything=True)
     wanted = {text.partition("=")[0]: files.parameter(loaded, text) for text in parameter}
+    if len(wanted) < len(parameter):
+        raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
     motions = []
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path))
+        gap = one.times[-1] / (len(one.times) - 1) / loaded.mj_model.opt.timestep
+        if gap > 200:  # milliseconds, perhaps
+            log(f"rows of {path} are {gap:.0f} time steps of the scene apart: is its time in seconds?")
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
         motions.append(one)

@@ -1,7 +1,6 @@
 """One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
 import contextlib
-import math
 import os
 import textwrap
 import time
@@ -13,23 +12,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._arrays import function, whole
+from mjxgrad._arrays import function, instance, real, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Measured, Noise, measure, repeated
-from mjxgrad.checking.motions import (
-    Direction,
-    Motions,
-    Mover,
-    Outcomes,
-    first_keyframe,
-    half_range,
-    most_contacts,
-    random_motions,
-)
+from mjxgrad.checking.measure import Measured, Noise, cost_along, measure
+from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.objective.task import as_pytree, checked_cost
 from mjxgrad.report import Block, page
@@ -41,7 +31,6 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
-_COST_STEPS = 100  # of a motion along which the cost is called
 _MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
@@ -142,9 +131,11 @@ def check(
         ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
         SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
-    if not budget > 0:
+    instance("derivatives", derivatives, bool, "True or False")
+    if not real("budget", budget) > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
-    function("log", log)
+    function("log", log, "text")
+    function("cost", None if isinstance(cost, str) else cost, "trajectory")
     say = log or (lambda _: None)
     rng = np.random.default_rng(whole("seed", seed, 0))
     with warnings.catch_warnings(record=True) as caught:
@@ -159,7 +150,7 @@ def check(
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = _outcomes(scene, outcome, rng)
     if cost is not None:
-        found += _cost_findings(motions, Mover(scene, 1, outcomes))
+        found += findings.cost_findings(*cost_along(motions, Mover(scene, 1, outcomes)))
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
@@ -184,25 +175,6 @@ def check(
         motions=motions,
         measured=measured,
     )
-
-
-def _cost_findings(motions: Motions, mover: Mover) -> Iterator[Finding]:
-    """Call the cost once, along a random motion that stays finite, and yield what its value or derivative lacks."""
-    rng = np.random.default_rng(0)
-    for i in np.flatnonzero(motions.bad_steps < 0)[:1].tolist():
-        steps = min(_COST_STEPS, motions.controls.shape[1])
-        drawn = Direction(*(rng.normal(size=shape) for shape in 2 * [motions.qvel.shape[2:]] + [motions.controls.shape[1:]]))
-        moved = mover.move("slope", repeated(motions.state(i, 0), 1), motions.controls[i : i + 1], drawn, [steps])
-        value, derivative = (float(x[0, 0, 0]) for x in (moved.outcomes, moved.derivatives))
-        told = f"The cost is {value:.3g} after {steps * motions.timestep:.2g} s of a random motion"
-        if not math.isfinite(value + derivative):
-            text = f"{told}, and its derivative {derivative:.3g}. A root or a norm at zero has no derivative."
-            yield Finding("cost", text, True)
-        elif derivative == 0:
-            text = f"{told}, and its derivative is zero, as of counts, rounding and comparisons: take zeroth_order."
-            yield Finding("cost", text, True)
-        else:
-            yield Finding("note", f"{told}.")
 
 
 def _max_contacts(scene: Scene, motions: Motions) -> int | None:

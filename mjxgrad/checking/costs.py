@@ -4,7 +4,6 @@ import functools
 import importlib
 import runpy
 import sys
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -48,10 +47,7 @@ def named_cost(scene: Scene, name: str) -> Cost:
 
 
 def _function(name: str) -> Callable[..., Any]:
-    """Return a function by file.py:function or module:function, the module also in the current folder.
-
-    An error in the function becomes a sentence that names the line.
-    """
+    """Return a function by file.py:function or module:function, the module also in the current folder."""
     source, _, function = name.rpartition(":")
     if source.endswith(".py") and not Path(source).is_file():
         raise ValueError(f"cost: there is no file {source}")
@@ -60,7 +56,7 @@ def _function(name: str) -> Callable[..., Any]:
         names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
     except Exception as error:  # a user's file may raise anything
         forms = "file.py:function, module:function, or of a body as height:torso"
-        raise ValueError(f"cost must be {forms}, got {name!r}: {error}") from error
+        raise ValueError(f"cost must be {forms}, got {name!r}: {type(error).__name__}: {error}") from error
     if not callable(names.get(function)):
         there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
         raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
@@ -71,8 +67,8 @@ def _function(name: str) -> Callable[..., Any]:
         try:
             return cost(trajectory)
         except Exception as error:
-            lines = [one.lineno for one in traceback.extract_tb(error.__traceback__) if one.filename.endswith(source)]
-            where = f" in line {lines[-1]}" if lines else ""
+            inside = error.__traceback__.tb_next  # pyright: ignore[reportOptionalMemberAccess]
+            where = f" in line {inside.tb_lineno}" if inside else ""
             raise ValueError(f"cost: {name} raised {type(error).__name__}{where}: {error}") from error
 
     return called

@@ -42,6 +42,7 @@ _BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 4
 _NUM_BATCHES = 24.0  # approximate number of batches in all
 _LINE_BATCHES, _NOISE_BATCHES = 6, 1
+_COST_STEPS = 100  # of a motion along which a cost is called once
 _SMALLEST_JUMP = 0.05  # share of the outcome's variation along the line
 _AT_REST = 1e-3  # share of the largest variation at any time
 _UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
@@ -176,7 +177,7 @@ def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | f
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
     still = np.zeros(motions.qvel.shape[2])
     direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
-    states = repeated(motions.state(0, 0), mover.size)
+    states = _repeated(motions.state(0, 0), mover.size)
     controls = np.repeat(motions.controls[:1, :_TRIED_STEPS], mover.size, axis=0)
     mover.move("slope", states, controls, direction, [_TRIED_STEPS])
     affordable = seconds / (_NUM_BATCHES * mover.step_seconds)
@@ -184,8 +185,17 @@ def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | f
     return sorted({max(1, round(num_steps * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
 
 
-def repeated(state: State, size: int) -> State:
-    """Return a batch of one state."""
+def cost_along(motions: Motions, mover: Mover) -> tuple[float, float, float]:
+    """Return the cost of the first random motion that stays finite, its derivative along a change, and the duration (s)."""
+    rng, motion = np.random.default_rng(0), int(np.argmax(motions.bad_steps < 0))
+    controls = motions.controls[motion, None, :_COST_STEPS]
+    shapes = motions.qvel.shape[2:], motions.qvel.shape[2:], controls.shape[1:]
+    start, change = _repeated(motions.state(motion, 0), 1), Direction(*map(rng.normal, (0, 0, 0), (1, 1, 1), shapes))
+    found = mover.move("slope", start, controls, change, [controls.shape[1]])
+    return float(found.outcomes[0, 0, 0]), float(found.derivatives[0, 0, 0]), controls.shape[1] * motions.timestep
+
+
+def _repeated(state: State, size: int) -> State:
     return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], size, axis=0), state)
 
 
@@ -224,7 +234,7 @@ class _Probe:
         state, controls = self._at(motion, begin)
 
         def along(kind: Kind, places: Float[np.ndarray, " motions"]) -> Moved:
-            states = repeated(state, self.mover.size)
+            states = _repeated(state, self.mover.size)
             states.qpos[:] = moved(self.scene.mj_model, states.qpos, direction.positions, places)
             states.qvel[:] += places[:, None] * direction.velocities
             varied = controls + places[:, None, None] * direction.controls
@@ -282,7 +292,7 @@ class _Probe:
         wiggle = smooth(rng, steps, len(half), seconds) if has_controls else rng.normal(size=(1, still.size))
         along = wiggle / np.sqrt((wiggle**2).sum())
         noise = stddev * rng.normal(size=(size, *along.shape))
-        states = repeated(state, size)
+        states = _repeated(state, size)
         if has_controls:
             direction, noisy = Direction(still, still, along * half), controls + noise * half
         else:

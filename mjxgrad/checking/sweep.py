@@ -13,7 +13,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
-from mjxgrad._arrays import function, is_known, whole
+from mjxgrad._arrays import function, is_known, real, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
@@ -213,16 +213,18 @@ def sweep(
     Raises:
         ValueError: as `scene_task` and `bias_variance`, or if a stiffness or the noise is not positive.
     """
-    if not all(0 < k < np.inf for k in stiffness):
-        raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, stiffness))}")
-    if not 0 < noise < np.inf:
+    given = np.atleast_1d(np.asarray(real("stiffness", stiffness), float))
+    if not ((given > 0) & (given < np.inf)).all():
+        raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, given))}")
+    if not 0 < real("noise", noise) < np.inf:
         raise ValueError(f"noise must be positive and finite, got {noise}")
     whole("seed", seed, 0)
-    function("log", log)
-    scene = load_scene(source)
+    whole("num_samples", num_samples, 2)
+    function("log", log, "text")
+    scene = source if isinstance(source, Scene) else load_scene(source)
     task = scene_task(scene, cost, seed=seed, **task_settings)
     knob = Knob(task, noise, seed)
-    swept = sorted({*stiffness, knob.own}) if scene.pairs else [1.0]
+    swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     result = bias_variance(
         knob,
         jnp.zeros((1, 1)),

@@ -11,6 +11,7 @@ so one sweep of $f$ serves every $\theta$. The line is cut into equal cells and 
 error falls as 1/cells at a jump and faster elsewhere. Quadrature on regular points could not know its error at jumps.
 """
 
+import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
-from mjxgrad._arrays import function, whole
+from mjxgrad._arrays import function, one_key, whole
 from mjxgrad._programs import compile_once
 from mjxgrad._text import Printed, aligned, format_number
 from mjxgrad.contact import Softness
@@ -226,9 +227,8 @@ class BiasVariance(eqx.Module, Printed):
             f"Truth: {what} of the cost under noise, from separate rollouts; ± is half a {self.confidence:.0%} interval. "
             "Variance: of one rollout. *: a bias that is significant over the whole table."
         )
-        cut = [f"Interrupted: {self.num_left_out} of {self.num_left_out + len(self.cost)} are left out."]
-        too_stiff = [f"!: the time step is too long for it. {text}." for text in self._too_stiff if text]
-        return [told, *too_stiff[:1], *cut * bool(self.num_left_out)]
+        cut = [f"Interrupted: {self.num_left_out} rows are left out."] * bool(self.num_left_out)
+        return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1], *cut]
 
     @property
     def _too_stiff(self) -> list[str]:
@@ -311,7 +311,9 @@ def bias_variance(
         )
     params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
-    function("progress", progress)
+    function("progress", progress, "done", "total")
+    function("objective_of_softness", objective_of_softness, "softness")
+    one_key(key)
     stacked, count = _stacked(softness)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     objective, told = _warned(objective_of_softness, each)
@@ -336,19 +338,15 @@ def bias_variance(
             measured["reference_error"] = jnp.sqrt(sum(error**2 for _, error in runs)) / len(runs)
         return measured, _variance_intervals(samples, batches, confidence)
 
-    with ThreadPoolExecutor(_WORKERS) as pool:
-        futures = [pool.submit(row, one) for one in each]
-        try:
-            for done, future in enumerate(futures, 1):
-                future.result()
-                if progress is not None:
-                    progress(done, count)
-        except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)  # those that have begun are completed
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    rows = [future.result() for future in futures if not future.cancelled()]
+    rows = []
+    # The interruption closes the map, which then begins no other row.
+    with ThreadPoolExecutor(_WORKERS) as pool, contextlib.suppress(KeyboardInterrupt):
+        for done in pool.map(row, each):
+            rows.append(done)
+            if progress is not None:
+                progress(len(rows), count)
+    if not rows:
+        raise KeyboardInterrupt
     stacked = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
     ends = np.stack([row[1] for row in rows], axis=2)
@@ -500,5 +498,7 @@ def _stacked(softness: PyTree) -> tuple[PyTree, int]:
     softness = jax.tree.map(jnp.asarray, softness)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
     if len(lengths) != 1 or () in lengths or (0,) in lengths:
-        raise ValueError(f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}")
+        raise ValueError(
+            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; give arrays, not lists"
+        )
     return softness, lengths.pop()[0]

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import function, one_key, real, whole
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -76,6 +76,7 @@ class Environment(InScene):
     randomisation: Randomisation | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
 
     def __check_init__(self):
+        function("randomisation", self.randomisation, "key", "scene")
         for name in ("frame_skip", "episode_length"):
             whole(name, getattr(self, name))
 
@@ -141,6 +142,7 @@ class Environment(InScene):
         Args:
             key: consumed here; it decides all draws until the next reset.
         """
+        one_key(key)
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
         obs = self.observe(physics, memory)
@@ -156,6 +158,7 @@ class Environment(InScene):
         Raises:
             ValueError: if the action does not have one number per actuator.
         """
+        action = real("action", action)
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")

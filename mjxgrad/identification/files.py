@@ -1,5 +1,6 @@
 """Recordings and parameters from files, and identified scenes as MJCF."""
 
+import collections
 import csv
 import dataclasses
 import difflib
@@ -140,6 +141,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is no archive of arrays")
     with np.load(path) as arrays:
         wholes = {name: np.asarray(arrays[name], float) for name in arrays}
     wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
@@ -149,6 +152,8 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         names, *rows = [row for row in csv.reader(file) if row] or [[]]
+    if twice := [name for name, count in collections.Counter(map(str.strip, names)).items() if count > 1]:
+        raise ValueError(f"{', '.join(twice)} stands there more than once")
     for line, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")

@@ -26,6 +26,7 @@ from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
+from mjxgrad.rollouts.state import check_scene
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
@@ -91,12 +92,15 @@ def identify(
     instance("parameters", parameters, Mapping, "a dict from names to parameters")
     for part in parameters.values():
         instance("parameters", part, Parameter, "of mg.identification, such as mass(scene, 'torso')")
-    for part in recordings:
+    check_scene(scene)
+    instance("held_out", held_out, Sequence, "a list of recordings")
+    for part in (*recordings, *held_out):
         instance("recordings", part, Recording, "of mg.identification.Recording")
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     max_steps = whole("max_steps", max_steps)
-    function("log", log)
+    function("log", log, "step", "metrics")
+    instance("free_start", free_start, bool, "True or False")
     try:  # before anything is compiled
         importlib.import_module("optimistix")
     except ImportError as error:

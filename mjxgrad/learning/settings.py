@@ -1,8 +1,9 @@
 """Settings for learning from short windows."""
 
 import dataclasses
+from collections.abc import Sequence
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import instance, real, whole
 from mjxgrad.batched.device import is_gpu
 
 
@@ -54,17 +55,22 @@ class Settings:
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             whole(name, getattr(self, name))
+        for name in ("actor_scale", "actor_rate", "critic_rate", "largest_sample"):
+            if not real(name, getattr(self, name)) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("actor_layers", "critic_layers"):
+            instance(name, getattr(self, name), Sequence, "a tuple of hidden sizes, such as (64, 64)")
+            for size in getattr(self, name):
+                whole(name, size)
+        if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
+            raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
         for name in ("discount", "trace", *(["alpha"] if self.alpha is not None else [])):
-            if not 0 <= getattr(self, name) <= 1:
+            if not 0 <= real(name, getattr(self, name)) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
         if self.trace < 1 and not self.has_critic:
             raise ValueError(
                 f"trace must be 1 without a value function, got {self.trace}: there is nothing to blend with"
             )
-        if not self.largest_sample > 0:
-            raise ValueError(f"largest_sample must be positive, got {self.largest_sample}")
-        if min(self.stddev) <= 0:
-            raise ValueError(f"stddev must be positive at the beginning and at the end, got {self.stddev}")
         if (self.num_environments * self.window) % self.critic_batches:
             raise ValueError(
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "

@@ -5,6 +5,7 @@ A method is two functions, from a start to a carry and from a carry to the next;
 
 import functools
 import math
+import os
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -18,7 +19,7 @@ import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
-from mjxgrad._arrays import function
+from mjxgrad._arrays import function, instance
 from mjxgrad._programs import compile_once
 from mjxgrad.batched.device import all_devices
 from mjxgrad.loop import checkpoint as checkpoints
@@ -108,7 +109,7 @@ def run(
     segment: int,
     over: Sequence[list[int | None] | None] = (),
     log: Log | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | Path | None = None,
     on_all_devices: bool = False,
 ) -> Any:
     """Repeat a method until it is over, and return its `result`.
@@ -127,7 +128,9 @@ def run(
     Raises:
         ValueError: if the checkpoint has no folder, is damaged, or from a run with another program, arrays or start.
     """
-    function("log", log)
+    function("log", log, "step", "metrics")
+    instance("checkpoint", checkpoint, str | os.PathLike | None, "the path of a file")
+    checkpoint = None if checkpoint is None else Path(checkpoint)
     if checkpoint is not None and not checkpoint.parent.is_dir():
         raise ValueError(
             f"checkpoint must be in a folder that exists, got {checkpoint}; make {checkpoint.parent} first"

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import instance, whole
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -231,6 +231,7 @@ def closed_loop(
         Williams. Simple statistical gradient-following algorithms for connectionist
         reinforcement learning. Machine Learning 8, 1992, theorem 1.
     """
+    instance("policy", policy, Callable, "a function of params and state")
     stddev = _action_stddev(task, stddev)
     flat, unravel = (None, unchanged) if params is None else _flat(params)
     dim = None if flat is None else flat.size
@@ -263,6 +264,7 @@ class _ActionsTranspose:
 
 
 def _action_stddev(task: Task, stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:
+    instance("task", task, Task, "a task, such as mg.SceneTask")
     shape = (task.horizon, task.num_controls)
     if task.horizon * task.num_controls == 0:
         raise ValueError(

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import real
+
 Scalar = Float[Array, ""]
 Vector = Float[Array, " dim"]
 """The parameters, or one number for each."""
@@ -205,6 +207,7 @@ def gaussian(key: PRNGKeyArray, stddev: Float[Array, "..."], shape: tuple[int, .
 
 def positive(stddev: float | Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the standard deviation as an array; raise a ValueError if it is known and not positive."""
+    stddev = real("stddev", stddev)
     stddev = jnp.asarray(stddev, jnp.result_type(stddev, float))
     # A traced value (a noise schedule, a sweep) cannot be checked here.
     if not isinstance(stddev, jax.core.Tracer) and not bool((stddev > 0).all()):

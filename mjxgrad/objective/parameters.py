@@ -11,6 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import function as check_function
+from mjxgrad._arrays import whole
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -75,6 +77,8 @@ def parameter_noise(
     if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
     dim = width.shape[0] if width.ndim == 1 else dim
+    check_function("function", function, "params")
+    dim = None if dim is None else whole("dim", dim)
     return ParameterNoise(function=as_pytree(function), stddev=width, dim=dim)
 
 

@@ -15,9 +15,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mjxgrad._arrays import instance
+from mjxgrad._arrays import instance, whole
 from mjxgrad._text import write
-from mjxgrad.rollouts.trajectory import Trajectory
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -67,8 +66,9 @@ def frames(
     """
     mj_model = scene.mj_model if isinstance(scene, Scene) else scene
     instance("scene", mj_model, mujoco.MjModel, "of mg.load_scene, or a mujoco.MjModel")
-    if isinstance(qpos, Trajectory):
-        raise ValueError("qpos must be positions, got a trajectory: give its .qpos")
+    if hasattr(qpos, "qpos"):
+        raise ValueError(f"qpos must be positions, got a {type(qpos).__name__.lower()}: give its .qpos")
+    height, width = whole("height", height, None), whole("width", width, None)
     if timestep is None:
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
     positions = np.asarray(qpos, dtype=np.float64)
@@ -132,8 +132,9 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     except ImportError as error:
         raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
+    instance("path", path, str | os.PathLike, "the path of a file")
     path, video = Path(path), np.asarray(video)
-    if video.ndim != 4 or not len(video):
+    if video.ndim != 4 or not len(video) or video.shape[3] != 3:
         raise ValueError(f"video must have shape (frames, height, width, 3), got {video.shape}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path must be in an existing folder, got {path}")

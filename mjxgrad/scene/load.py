@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._arrays import instance
+from mjxgrad._arrays import instance, real, whole
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad._warnings import collected
 from mjxgrad.batched.device import own_device
@@ -79,7 +79,8 @@ def load_scene(
     """
     if softness is not None:
         instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
-    if max_contacts is not None and max_contacts < 1:
+    instance("keep_everything", keep_everything, bool, "True or False")
+    if max_contacts is not None and whole("max_contacts", max_contacts, None) < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:
         mj_model, name = _compile(source)
@@ -150,7 +151,7 @@ def count_pairs(model: mujoco.MjModel) -> int:
 
 def _set_timestep(model: mujoco.MjModel, name: str, timestep: float | None) -> None:
     if timestep is not None:
-        if not (math.isfinite(timestep) and timestep > 0):
+        if not (math.isfinite(real("timestep", timestep)) and timestep > 0):
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
         model.opt.timestep = timestep
     elif not (math.isfinite(model.opt.timestep) and model.opt.timestep > 0):

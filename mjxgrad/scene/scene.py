@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import instance, is_known
+from mjxgrad._arrays import instance, is_known, real
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
@@ -28,7 +28,9 @@ from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
 _OPTIONS = ("timestep", "gravity", "wind")
-_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "dof_armature", "timestep"}
+_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pair_friction", "timestep"} | {
+    f"dof_{name}" for name in ("armature", "frictionloss")
+}
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
@@ -107,6 +109,7 @@ class Scene(eqx.Module):
         every = numbers_of(self.model)
         options = {name: every[f"opt.{name}"] for name in _OPTIONS}
         arrays = {name: value for name, value in every.items() if "." not in name} | options
+        fields = {name: real(name, value) for name, value in fields.items()}
         for name, value in fields.items():
             if name not in arrays:
                 near = difflib.get_close_matches(name, arrays, n=3)
@@ -120,6 +123,8 @@ class Scene(eqx.Module):
         for name, least in known.items():
             if np.isnan(least):
                 raise ValueError(f"{name} must hold numbers, got NaN")
+            if name in _NOT_NEGATIVE and not np.isfinite(np.asarray(changed[name])).all():
+                raise ValueError(f"{name} must be finite, got inf")
             if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
                 raise ValueError(f"{name} must {requirement}, got {least:g}")

@@ -39,6 +39,11 @@ _Integrator = mujoco.mjtIntegrator
 
 @contextlib.contextmanager
 def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
+    if not (isinstance(model, mjx.Model) and isinstance(data, mjx.Data)):
+        given = f"{type(model).__name__} and {type(data).__name__}"
+        raise ValueError(
+            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
+        )
     if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
         raise ValueError(
             "model and data must be of MJX's JAX implementation, got "
@@ -71,18 +76,13 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
         NotImplementedError: if MJX lacks the integrator.
     """
     check_contact(contact, is_step=True)
-    if not (hasattr(model, "opt") and hasattr(data, "ctrl")):
-        given = f"{type(model).__name__} and {type(data).__name__}"
-        raise ValueError(
-            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
-        )
-    if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
-        kind = model.opt.integrator
-        raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
-    has_stages = model.opt.integrator == _Integrator.mjINT_RK4
-    ways: tuple[Callable, Callable] = (_stages, _after_stages) if has_stages else (_forward, _after_one)
-    evaluate, finish = ways
     with _at_full_precision(model, data):
+        if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
+            kind = model.opt.integrator
+            raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
+        has_stages = model.opt.integrator == _Integrator.mjINT_RK4
+        ways: tuple[Callable, Callable] = (_stages, _after_stages) if has_stages else (_forward, _after_one)
+        evaluate, finish = ways
         if not isinstance(contact, Slope):
             return finish(model, data, evaluate(model, data, contact))
         fixed, still = jax.lax.stop_gradient((model, data))
