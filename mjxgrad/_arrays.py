@@ -24,14 +24,8 @@ def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
     except (TypeError, ValueError):
         kind = np.dtype(object)
     if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
-        raise ValueError(f"{name} must be real numbers, got {shown(value) if kind.kind == 'O' else kind}")
+        raise ValueError(f"{name} must be real numbers, got {type(value).__name__ if kind.kind == 'O' else kind}")
     return jnp.asarray(value, dtype)
-
-
-def shown(value: Any) -> str:
-    """Return a value for messages: what fits into a line, else its type."""
-    text = repr(value)
-    return text if len(text) <= 80 and "\n" not in text else type(value).__name__
 
 
 def known(values: Any) -> np.ndarray | None:
@@ -59,8 +53,6 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
         raise ValueError(f"{name} must be known before anything is compiled, got a traced value; make it static")
     try:
         number = operator.index(value)
-        if isinstance(value, bool):
-            raise TypeError
     except TypeError:
         raise ValueError(f"{name} must be a whole number, got {value!r}") from None
     if least is not None and number < least:
@@ -81,7 +73,7 @@ def function(name: str, value: Any, *arguments: str) -> None:
             inspect.signature(value).bind(*arguments)
     except TypeError as error:
         wanted = f"{name} must be a function of {' and '.join(arguments)}"
-        raise ValueError(f"{wanted}, got {shown(value)}: {error}") from None
+        raise ValueError(f"{wanted}, got {type(value).__name__}: {error}") from None
     except ValueError:  # a function of C without a signature
         return
 

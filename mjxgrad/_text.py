@@ -54,7 +54,9 @@ def write(path: str | Path, content: str | bytes) -> None:
     path = Path(path)
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        with partial.open("wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            os.fsync(file.fileno())
         partial.replace(path)
     except OSError as error:
         raise OSError(f"{path} could not be written: {error.strerror}") from error

@@ -85,13 +85,8 @@ def main(arguments: list[str] | None = None) -> int:
     interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
     interruptions: list[int] = []
-
-    def interrupt(number: int, _: Any) -> None:
-        interruptions.append(number)
-        raise KeyboardInterrupt
-
     for number in (signal.SIGINT, signal.SIGTERM):  # SIGTERM is handled like Ctrl-C
-        signal.signal(number, interrupt)
+        signal.signal(number, lambda *given: interruptions.append(given[0]) or signal.default_int_handler(*given))
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
         if interruptions:  # the library has returned what was measured

@@ -149,8 +149,8 @@ def check(
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = _outcomes(scene, outcome, rng)
-    if cost is not None:
-        found += findings.cost_findings(*cost_along(motions, Mover(scene, 1, outcomes)))
+    if cost is not None and (motions.bad_steps < 0).any():
+        found.append(findings.cost_finding(*cost_along(motions, Mover(scene, 1, outcomes))))
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")

@@ -1,6 +1,5 @@
 """Costs by name: functions of files and modules, and height, speed, uprightness and reach of bodies."""
 
-import functools
 import importlib
 import runpy
 import sys
@@ -62,7 +61,6 @@ def _function(name: str) -> Callable[..., Any]:
         raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
     cost = names[function]
 
-    @functools.wraps(cost)
     def called(trajectory: Trajectory) -> Any:
         try:
             return cost(trajectory)

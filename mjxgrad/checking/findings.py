@@ -107,12 +107,12 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         yield Finding("note", f"In contact from the start, and nothing else touches: {name_pairs(motions.touching)}.")
 
 
-def cost_findings(value: float, derivative: float, seconds: float) -> Iterator[Finding]:
-    """Yield a cost's value and derivative along a random motion; a fault where they are of no use."""
+def cost_finding(value: float, derivative: float, seconds: float) -> Finding:
+    """Return a cost's value and derivative along a random motion; a fault where they are of no use."""
     is_useless = derivative == 0 or not math.isfinite(value + derivative)
-    remedy = " Norms and roots at zero have no derivative, counts and comparisons have zero." if is_useless else ""
     text = f"The cost is {value:.3g} after {seconds:.2g} s of a random motion, its derivative along a change {derivative:.2g}."
-    yield Finding("cost", text + remedy, is_useless)
+    remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero."
+    return Finding("cost", text + remedy * is_useless, is_useless)
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:

@@ -11,8 +11,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad._arrays import function as check_function
-
 # A jump keeps at least this share of its change in a division. A slope keeps one part in many, a square root its root.
 _KEPT = 0.5
 
@@ -71,7 +69,6 @@ def jumps_along(
         ValueError: if the interval is empty, `num_points` is not a multiple of `num_candidates` and at least two,
             `num_refinements` is below 1, or the function does not return one value per parameter.
     """
-    check_function("function", function, "points")
     low, high = interval
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"interval must be two finite numbers, the smaller one first, got {interval}")

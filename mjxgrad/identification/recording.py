@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mjxgrad._arrays import instance, real, shown
+from mjxgrad._arrays import instance, real
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.rollouts import State, initial_state, rollout
@@ -51,9 +51,8 @@ class Recording:
         rows = {name: np.asarray(real(f"{name} of {self.name}", value), float) for name, value in self.measured.items()}
         for name in ("controls", "times", "control_times"):
             value = getattr(self, name)
-            numbers = None if value is None else np.asarray(real(f"{name} of {self.name}", value), float)
-            if numbers is not None and not (numbers.ndim and np.isfinite(numbers).all()):
-                raise ValueError(f"{name} of {self.name} must be finite, one row per time, got {shown(value)}")
+            if value is not None and not (np.ndim(value) and np.isfinite(real(f"{name} of {self.name}", value)).all()):
+                raise ValueError(f"{name} of {self.name} must be finite, one row per time, got {value}")
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
         if len(lengths) != 1 or 0 in lengths:

@@ -1,9 +1,8 @@
 """Checkpoints: a run on disk, complete or not at all."""
 
 import hashlib
+import io
 import json
-import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+
+from mjxgrad._text import write
 
 FORMAT = 3
 _PARTS = {
@@ -25,17 +26,9 @@ def save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
     """Write a pytree of arrays atomically: an interruption leaves the former file intact."""
     leaves = {f"leaf{i}": _as_numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
     header = json.dumps({"format": FORMAT, **fingerprint}).encode()
-    # In the same folder: a rename is atomic within one file system only.
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, header=np.frombuffer(header, np.uint8), **leaves)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with io.BytesIO() as file:
+        np.savez(file, allow_pickle=False, header=np.frombuffer(header, np.uint8), **leaves)
+        write(path, file.getvalue())
 
 
 def load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import real
+from mjxgrad._arrays import instance, real
 
 Scalar = Float[Array, ""]
 Vector = Float[Array, " dim"]
@@ -161,11 +161,8 @@ def unchanged(vector: Vector) -> Vector:
 
 def as_objective(objective: Any) -> Objective:
     """Return an objective unchanged; raise a ValueError for anything else."""
-    if not isinstance(objective, Objective):
-        raise ValueError(
-            f"objective must be an Objective, got {type(objective).__name__}; wrap a function by mg.parameter_noise, "
-            "or give optimise annealing= with a function from a scale to an objective"
-        )
+    remedy = "wrap a function by mg.parameter_noise, or give optimise annealing= with a function from a scale to an objective"
+    instance("objective", objective, Objective, f"an Objective ({remedy})")
     return objective
 
 

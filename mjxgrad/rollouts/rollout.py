@@ -77,7 +77,6 @@ def rollout(
         raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
     function("observe", observe, "model", "data")
     instance("checkpoint", checkpoint, bool, "True or False")
-    instance("measure_growth", measure_growth, bool, "True or False")
     policy = controls if callable(controls) else None
     function("policy", policy, "params", "state")
     if policy is None and params is not None:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float, Int
 
-from mjxgrad._arrays import is_known_to_be
+from mjxgrad._arrays import instance, is_known_to_be
 from mjxgrad._mjx import mjx
 from mjxgrad.batched import cholesky
 from mjxgrad.bodies import forces, kinematics, mended
@@ -39,11 +39,8 @@ _Integrator = mujoco.mjtIntegrator
 
 @contextlib.contextmanager
 def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
-    if not (isinstance(model, mjx.Model) and isinstance(data, mjx.Data)):
-        given = f"{type(model).__name__} and {type(data).__name__}"
-        raise ValueError(
-            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
-        )
+    instance("model", model, mjx.Model, "MJX's, as scene.model; for a scene and a state see mg.rollout")
+    instance("data", data, mjx.Data, "MJX's, as scene.data; for a scene and a state see mg.rollout")
     if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
         raise ValueError(
             "model and data must be of MJX's JAX implementation, got "
