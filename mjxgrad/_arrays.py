@@ -24,7 +24,7 @@ def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
     except (TypeError, ValueError):
         kind = np.dtype(object)
     if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
-        raise ValueError(f"{name} must be real numbers, got {type(value).__name__ if kind.kind == 'O' else kind}")
+        raise ValueError(f"{name} must be real numbers, got {type(value).__name__ if kind.kind in 'OU' else kind}")
     return jnp.asarray(value, dtype)
 
 

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjxgrad._arrays import instance
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import forces, kinematics, tree
 
@@ -34,6 +35,7 @@ def set_const(model: mjx.Model) -> mjx.Model:
     Args:
         model: a model of MJX's JAX implementation.
     """
+    instance("model", model, mjx.Model, "MJX's, as scene.model")
     return model.replace(**constants_of(model))  # pyright: ignore[reportReturnType]
 
 

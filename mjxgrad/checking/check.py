@@ -155,7 +155,7 @@ def check(
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
-        with contextlib.suppress(TimeoutError):
+        with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(
                 scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
             )

@@ -77,7 +77,7 @@ def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
     counts = {"body": (model.nbody, model.body), "site": (model.nsite, model.site)}
     known = {kind: [at(i).name for i in range(count)] for kind, (count, at) in counts.items()}
     for kind, names in known.items():
-        if name in names:
+        if name and name in names:
             return names.index(name), kind == "body"
     there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
     raise ValueError(f"there is no body or site {name!r} in the scene, but {there}")

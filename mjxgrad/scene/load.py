@@ -101,6 +101,7 @@ def load_scene(
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported)  # pyright: ignore[reportArgumentType]
     messages = [f"MuJoCo says: {text}" for text in told]
+    messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
     messages += [f"C MuJoCo steps it: {unsupported}"] if unsupported and engine is None else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
