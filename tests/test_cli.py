@@ -55,12 +55,15 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
         (["check", "nowhere.xml"], "there is no file nowhere.xml"),
         (["check", "refused.xml"], "got none (nv = 0)"),
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
-        (["check", "scene.xml", "--quick", "--cost", "costs.py:wrong"], "wrong raised AttributeError in line 8: "),
+        (
+            ["check", "scene.xml", "--quick", "--cost", "costs.py:wrong"],
+            "got 'costs.py:wrong', with AttributeError: 'Trajectory' object has no",
+        ),
         (["check", "scene.xml", "--quick", "--cost", "costs.py:lost"], "costs.py has no function 'lost', but height"),
         (["check", "scene.xml", "--quick", "--cost", "costs.py"], "cost must be file.py:function"),
         (["check", "scene.xml", "--quick", "--cost", "scene.xml:cost"], "cost must be file.py:function"),
-        (["check", "scene.xml", "--quick", "--seed", "1.5"], 'unable to convert "1.5" into int'),
-        (["sweep", "scene.xml", "--samples", "1.5"], 'unable to convert "1.5" into int'),
+        (["check", "scene.xml", "--quick", "--seed", "1.5"], "invalid literal for int() with base 10: '1.5'"),
+        (["sweep", "scene.xml", "--samples", "1.5"], "invalid literal for int() with base 10: '1.5'"),
         (["sweep", "scene.xml", "--samples", "0"], "num_samples must be at least 2, got 0"),
         (["sweep", "scene.xml", "--horizon", "-1"], "horizon must be at least 1, got -1"),
         (["sweep", "scene.xml", "--start", "home"], "keyframe must be one of none in this scene, got 'home'"),
@@ -143,8 +146,16 @@ _SHORT = ["--samples", "4", "--horizon", "20", "--engine", "mujoco"]
 @pytest.mark.parametrize(
     ("arguments", "at", "said"),
     [
-        (["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"], "1 of 3", "Interrupted: 2 rows are left out."),
-        (["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"], "2 of 3", "Interrupted: 1 rows are left out."),
+        (
+            ["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"],
+            "1 of 3",
+            "Interrupted: 2 of 3 stiffnesses are left out.",
+        ),
+        (
+            ["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"],
+            "2 of 3",
+            "Interrupted: 1 of 3 stiffnesses are left out.",
+        ),
         ([*_IDENTIFY[:4], "gear:push"], "step 1:", "The search was interrupted: do not trust the values."),
         (["check", "scene.xml"], "derivatives over", "Derivatives were not measured"),
     ],
@@ -229,6 +240,17 @@ def test_a_program_is_short_starts_at_the_key_frame_and_holds_no_code_of_a_file_
     assert "stop" not in compile(program, "task.py", "exec").co_names
     assert len(program.splitlines()) <= 40
     assert "mg.initial_state(scene, keyframe='home')" in program
+
+
+@pytest.mark.parametrize("command", [["-m", "mjxgrad", "check", "scene.xml"], ["-c", "import mjxgrad"]])
+def test_a_switch_of_jax_that_is_no_switch_is_said_in_one_line(scene, command):
+    environment = {**os.environ, "JAX_ENABLE_X64": "maybe", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
+    *before, line = done.stderr.splitlines()
+    assert "JAX_ENABLE_X64" in line
+    assert line.endswith("JAX's switches are true or false, 1 or 0")
+    assert not any("jax/" in one for one in before)
+    assert len(before) == 0 or command[0] == "-c"
 
 
 def test_a_platform_that_is_not_there_is_said_in_one_line(scene):

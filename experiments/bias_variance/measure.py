@@ -94,7 +94,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 compiler_options=compiler_options() if settings.problem == "own" else None,
                 progress=lambda done, _: advance_to(done),
             )
-            if found.num_left_out:
+            if len(found.cost) < len(stiffness):
                 raise KeyboardInterrupt
             return found
 

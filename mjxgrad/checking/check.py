@@ -18,7 +18,7 @@ from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Measured, Noise, cost_along, measure
+from mjxgrad.checking.measure import Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.objective.task import as_pytree, checked_cost
@@ -150,7 +150,7 @@ def check(
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = _outcomes(scene, outcome, rng)
     if cost is not None and (motions.bad_steps < 0).any():
-        found.append(findings.cost_finding(*cost_along(motions, Mover(scene, 1, outcomes))))
+        found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
@@ -161,7 +161,10 @@ def check(
             )
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
-    advice = findings.recommend(scene, motions, stability, measured, _max_contacts(scene, motions))
+    # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
+    room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
+    slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
+    advice = findings.recommend(scene, motions, stability, measured, slots)
     path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,
@@ -175,13 +178,6 @@ def check(
         motions=motions,
         measured=measured,
     )
-
-
-def _max_contacts(scene: Scene, motions: Motions) -> int | None:
-    """Return a number of contact slots to set, if motions needed far fewer than all."""
-    # Other motions may have more contacts than these.
-    room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
-    return room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
 
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:

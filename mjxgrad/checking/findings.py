@@ -5,11 +5,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import jax
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured
-from mjxgrad.checking.motions import REFINED, Motions
+from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts.trajectory import LARGEST_GROWTH
 from mjxgrad.scene import Scene
@@ -18,6 +19,7 @@ Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
     "cost", "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
+_COST_STEPS = 100  # of a motion along which a cost is called once
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
@@ -107,12 +109,20 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         yield Finding("note", f"In contact from the start, and nothing else touches: {name_pairs(motions.touching)}.")
 
 
-def cost_finding(value: float, derivative: float, seconds: float) -> Finding:
-    """Return a cost's value and derivative along a random motion; a fault where they are of no use."""
+def cost_finding(motions: Motions, mover: Mover) -> Finding:
+    """Call the cost once with its derivative, along a random motion that stays finite; useless ones are a fault."""
+    rng, motion = np.random.default_rng(0), int(np.argmax(motions.bad_steps < 0))
+    controls = motions.controls[motion, None, :_COST_STEPS]
+    start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motions.state(motion, 0))
+    change = Direction(*[rng.normal(size=x.shape[1:]) for x in (start.qvel, start.qvel, controls)])
+    found = mover.move("slope", start, controls, change, [controls.shape[1]])
+    value, derivative = found.outcomes.item(), found.derivatives.item()
     is_useless = derivative == 0 or not math.isfinite(value + derivative)
-    text = f"The cost is {value:.3g} after {seconds:.2g} s of a random motion, its derivative along a change {derivative:.2g}."
-    remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero."
-    return Finding("cost", text + remedy * is_useless, is_useless)
+    when = f"after {controls.shape[1] * motions.timestep:.2g} s of a random motion"
+    remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero." * is_useless
+    return Finding(
+        "cost", f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}", is_useless
+    )
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:

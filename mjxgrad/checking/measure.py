@@ -42,7 +42,6 @@ _BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 4
 _NUM_BATCHES = 24.0  # approximate number of batches in all
 _LINE_BATCHES, _NOISE_BATCHES = 6, 1
-_COST_STEPS = 100  # of a motion along which a cost is called once
 _SMALLEST_JUMP = 0.05  # share of the outcome's variation along the line
 _AT_REST = 1e-3  # share of the largest variation at any time
 _UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
@@ -183,16 +182,6 @@ def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | f
     affordable = seconds / (_NUM_BATCHES * mover.step_seconds)
     num_steps = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
     return sorted({max(1, round(num_steps * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
-
-
-def cost_along(motions: Motions, mover: Mover) -> tuple[float, float, float]:
-    """Return the cost of the first random motion that stays finite, its derivative along a change, and the duration (s)."""
-    rng, motion = np.random.default_rng(0), int(np.argmax(motions.bad_steps < 0))
-    controls = motions.controls[motion, None, :_COST_STEPS]
-    shapes = motions.qvel.shape[2:], motions.qvel.shape[2:], controls.shape[1:]
-    start, change = _repeated(motions.state(motion, 0), 1), Direction(*map(rng.normal, (0, 0, 0), (1, 1, 1), shapes))
-    found = mover.move("slope", start, controls, change, [controls.shape[1]])
-    return float(found.outcomes[0, 0, 0]), float(found.derivatives[0, 0, 0]), controls.shape[1] * motions.timestep
 
 
 def _repeated(state: State, size: int) -> State:

@@ -239,7 +239,9 @@ def sweep(
     question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
     question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
-    if row < len(result.cost):  # not left out by an interruption
+    if left_out := len(swept) - len(result.cost):
+        question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."
+    if row < len(result.cost):
         ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
         ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
         question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."

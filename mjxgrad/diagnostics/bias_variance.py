@@ -128,7 +128,6 @@ class BiasVariance(eqx.Module, Printed):
         landscape: the cost along the parameter at every softness; None unless there is a single parameter with noise.
         warnings: the warnings of the scene at each softness, such as a time step that is too long; often empty.
         confidence: coverage of every interval.
-        num_left_out: number of softnesses that an interruption left out, the last ones.
     """
 
     softness: PyTree
@@ -143,7 +142,6 @@ class BiasVariance(eqx.Module, Printed):
     landscape: Landscape | None
     warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
-    num_left_out: int = eqx.field(static=True, default=0)
 
     @property
     def bias(self) -> Float[Array, "softness points dim"]:
@@ -227,8 +225,7 @@ class BiasVariance(eqx.Module, Printed):
             f"Truth: {what} of the cost under noise, from separate rollouts; ± is half a {self.confidence:.0%} interval. "
             "Variance: of one rollout. *: a bias that is significant over the whole table."
         )
-        cut = [f"Interrupted: {self.num_left_out} rows are left out."] * bool(self.num_left_out)
-        return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1], *cut]
+        return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1]]
 
     @property
     def _too_stiff(self) -> list[str]:
@@ -314,7 +311,12 @@ def bias_variance(
     function("progress", progress, "done", "total")
     function("objective_of_softness", objective_of_softness, "softness")
     one_key(key)
-    stacked, count = _stacked(softness)
+    stacked = jax.tree.map(jnp.asarray, softness)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(stacked)}
+    if len(lengths) != 1 or () in lengths or (0,) in lengths:
+        told = f"got lengths {sorted(lengths)}; give arrays, not lists"
+        raise ValueError(f"softness must have the same leading axis in every leaf, {told}")
+    ((count,),) = lengths
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     objective, told = _warned(objective_of_softness, each)
     # Derivatives by the noise where it is known: α-order needs them, and those by the parameters follow.
@@ -357,7 +359,6 @@ def bias_variance(
         variance_intervals=dict(zip(ESTIMATES, ends, strict=False)),
         warnings=told[: len(rows)],
         confidence=confidence,
-        num_left_out=count - len(rows),
     )
 
 
@@ -491,14 +492,3 @@ def _variance_intervals(
         terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
         intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)
-
-
-def _stacked(softness: PyTree) -> tuple[PyTree, int]:
-    """Return a pytree of arrays with one leading axis, and its length."""
-    softness = jax.tree.map(jnp.asarray, softness)
-    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
-    if len(lengths) != 1 or () in lengths or (0,) in lengths:
-        raise ValueError(
-            f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}; give arrays, not lists"
-        )
-    return softness, lengths.pop()[0]

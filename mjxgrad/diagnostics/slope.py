@@ -22,8 +22,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from mjxgrad._arrays import whole
-
 _FEWEST_PHASES = 32  # for eight blocks of the error bar
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
@@ -100,7 +98,7 @@ def phases(interval: tuple[float, float], num_phases: int) -> Float[np.ndarray, 
     low, high = interval
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"interval must be two finite numbers, the smaller one first, got {interval}")
-    if whole("num_phases", num_phases, None) < _FEWEST_PHASES:
+    if num_phases < _FEWEST_PHASES:
         raise ValueError(f"num_phases must be at least {_FEWEST_PHASES}, got {num_phases}: fewer give no error bar")
     places = np.random.default_rng(0).uniform(size=num_phases)
     return low + (high - low) * (np.arange(num_phases) + places) / num_phases

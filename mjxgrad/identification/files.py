@@ -1,6 +1,5 @@
 """Recordings and parameters from files, and identified scenes as MJCF."""
 
-import collections
 import csv
 import dataclasses
 import difflib
@@ -152,7 +151,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         names, *rows = [row for row in csv.reader(file) if row] or [[]]
-    if twice := [name for name, count in collections.Counter(map(str.strip, names)).items() if count > 1]:
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
         raise ValueError(f"{', '.join(twice)} stands there more than once")
     for line, row in enumerate(rows, 2):
         if len(row) != len(names):

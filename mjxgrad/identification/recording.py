@@ -67,8 +67,7 @@ class Recording:
             value = getattr(self, name)
             if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
                 raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
-        if self.start is not None:
-            instance(f"start of {self.name}", self.start, State, "of mg.initial_state")
+        instance(f"start of {self.name}", self.start, State | None, "of mg.initial_state")
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
         for name, value in self.noise.items():

@@ -26,7 +26,6 @@ from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
-from mjxgrad.rollouts.state import check_scene
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
@@ -92,7 +91,7 @@ def identify(
     instance("parameters", parameters, Mapping, "a dict from names to parameters")
     for part in parameters.values():
         instance("parameters", part, Parameter, "of mg.identification, such as mass(scene, 'torso')")
-    check_scene(scene)
+    instance("scene", scene, Scene, "of mg.load_scene")
     instance("held_out", held_out, Sequence, "a list of recordings")
     for part in (*recordings, *held_out):
         instance("recordings", part, Recording, "of mg.identification.Recording")
@@ -111,14 +110,12 @@ def identify(
     has_noise = all(set(one.noise) == set(one.measured) for one in recordings)
     is_left = has_noise and not free_start and end.stopped is not Stopped.INTERRUPTED
     if is_left and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
-        try:
+        again = end._replace(stopped=Stopped.INTERRUPTED)
+        with contextlib.suppress(KeyboardInterrupt):
             again = _descend(program, program.searched(), max_steps, log)
-        except KeyboardInterrupt:
-            again = end._replace(stopped=Stopped.INTERRUPTED)
+        end = end._replace(stopped=again.stopped if again.stopped is Stopped.INTERRUPTED else end.stopped)
         if _rms(program, again.found) < _rms(program, end.found):
             end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
-        elif again.stopped is Stopped.INTERRUPTED:
-            end = end._replace(stopped=again.stopped)
     return _identified(program, end, held_out, has_noise)
 
 
@@ -139,6 +136,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
     values = np.asarray(coordinates.values(end.point[: len(coordinates.names)]), float)
     explained = on_host(end.found)
     residual, slope, num_offsets = _without_offsets(*explained)
+    signals = explained[0].reshape(*program.windows.index.shape, -1)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     after, before = np.linalg.norm(residual), end.first * np.sqrt(numbers)
@@ -156,7 +154,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
         has_noise=has_noise,
         held_out_rms=None if end.stopped is Stopped.INTERRUPTED else program.held_out_rms(held_out, nominal, values),
         offsets=np.asarray(program.offsets(end.point)) if program.free_start else None,
-        correlation=_correlation(program.windows, explained[0]),
+        correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
         removable=end.removable,
         num_numbers=numbers,
         num_steps=end.num_steps,
@@ -372,13 +370,6 @@ def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, siz
     if program.free_start:
         slope = jnp.concatenate([slope, jax.scipy.linalg.block_diag(*found[2]) / size], axis=1)
     return point, residual, slope
-
-
-def _correlation(windows: Windows, residual: np.ndarray) -> float:
-    """Return the correlation of residuals with those of the same signal one time before, from -1 to 1."""
-    signals = residual.reshape(*windows.index.shape, -1)
-    squares = float((signals**2).sum())
-    return float((signals[:, 1:] * signals[:, :-1]).sum()) / squares if squares else 0.0
 
 
 def _without_offsets(

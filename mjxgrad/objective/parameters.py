@@ -11,8 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function as check_function
-from mjxgrad._arrays import whole
+from mjxgrad import _arrays
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -77,8 +76,8 @@ def parameter_noise(
     if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
     dim = width.shape[0] if width.ndim == 1 else dim
-    check_function("function", function, "params")
-    dim = None if dim is None else whole("dim", dim)
+    _arrays.function("function", function, "params")
+    dim = None if dim is None else _arrays.whole("dim", dim)
     return ParameterNoise(function=as_pytree(function), stddev=width, dim=dim)
 
 

@@ -176,7 +176,7 @@ def checked_cost(cost: Any, horizon: int) -> Float[Array, "*steps"]:
     if not eqx.is_array_like(cost) or jnp.shape(cost) not in ((), (horizon + 1,)):
         wanted = f"a scalar of shape () or one number per state, shape ({horizon + 1},)"
         raise ValueError(f"the task's cost must return {wanted}, got {form(cost)}")
-    return jnp.asarray(cost)
+    return jnp.asarray(cost, jnp.result_type(cost, float))
 
 
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:
