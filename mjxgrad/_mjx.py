@@ -1,6 +1,4 @@
-"""The first import of JAX and MuJoCo, and the only one of MJX.
-
-A wrong variable of the environment ends in a sentence here, where JAX and MuJoCo end in a traceback.
+"""The first import of JAX and MuJoCo, where a wrong variable of the environment ends in a sentence; the only one of MJX.
 
 `mujoco.mjx` prints two lines to stdout if NVIDIA Warp is absent, which this library does not use.
 A library must not print, and stdout may carry a program's results. Only those two lines are
@@ -13,13 +11,12 @@ import importlib.metadata
 import io
 import os
 import sys
-from pathlib import Path
 
 try:
     importlib.import_module("jax")
 except ValueError as error:
     _told = f"JAX refuses the environment: {error}; JAX's switches are true or false, 1 or 0"
-    if Path(sys.argv[0]).name not in ("-m", "mjxgrad"):
+    if not sys.argv[0].endswith(("-m", "mjxgrad")):
         raise ValueError(_told) from None
     print(_told, file=sys.stderr)  # the command line
     sys.exit(2)

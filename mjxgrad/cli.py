@@ -62,8 +62,7 @@ mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 '''
 
 
-# cyclopts alone would round 1.5.
-Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]
+Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
 
 
 class CommandError(Exception):

@@ -1,12 +1,14 @@
 """One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
 import contextlib
+import functools
 import os
 import textwrap
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -16,13 +18,12 @@ from mjxgrad._arrays import function, instance, real, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
-from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Measured, Noise, measure
+from mjxgrad.checking.measure import Line, Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.objective.task import as_pytree, checked_cost
-from mjxgrad.report import Block, page
+from mjxgrad.report import INK, Block, page, svg
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -31,6 +32,8 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
+_SIZE = (4.6, 2.9)  # of a figure, in inches
+_UNITS = {"where": "m, rad", "how": "m/s, rad/s"}  # by an outcome's first word; others have the user's units
 _MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
@@ -256,3 +259,56 @@ task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={adv
 objective = {objective}
 estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
 """
+
+
+def telling(measured: Measured, outcomes: Sequence[str]) -> Block:
+    """Draw the line on which MuJoCo's derivative is farthest from the slope, or the line with the largest jump."""
+    line, time, outcome = _most_telling(measured)
+    words, of = outcomes[outcome], (slice(None), time, outcome)
+    unit = _UNITS.get(words.partition(" ")[0], "units of the cost")
+    caption = (
+        f"{words[:1].upper() + words[1:]} after {measured.times[time]:.2g} s, along a random change of {line.varied} "
+        f"({line.pose}). The other figure: its derivatives, which should lie on the grey slope."
+    )
+    caption += " Dashed: a jump." * bool(len(line.jumps.places))
+    x, fine, (smooth, plain) = line.plain.parameters, line.fine.outcomes[of], line.plain.derivatives[:, *of]
+    panel = functools.partial(_panel, x, line.jumps.places)
+    moved = {"MuJoCo": (line.plain.outcomes[of], INK, "o")}
+    derived = {"discrete": (plain, "#d55e00", "s"), "slope": (smooth, "#009e73", "o")}
+    drawings = [
+        svg(lambda: panel(f"outcome ({unit})", "shorter time steps", fine, moved), "The outcome along the line"),
+        svg(lambda: panel(f"derivative ({unit})", "its slope", np.gradient(fine, x), derived), "Its derivatives"),
+    ]
+    return Block(drawings=drawings, caption=caption)
+
+
+def _most_telling(measured: Measured) -> tuple[Line, int, int]:
+    jumping = [line for line in measured.lines if len(line.jumps.places)]
+    if jumping:
+        line = max(jumping, key=lambda one: float(one.jumps.sizes.max()))
+        sizes = np.abs(line.jumps.after - line.jumps.before)[line.jumps.largest]
+        return line, len(measured.times) - 1, int(sizes.argmax())
+    compared = [line.plain for line in measured.lines]
+    errors = [np.where(one.is_resolved(), one.relative_error[1], 0) for one in compared]
+    number, time, outcome = np.unravel_index(int(np.argmax(errors)), np.shape(errors))
+    return measured.lines[int(number)], int(time), int(outcome)
+
+
+def _panel(x: np.ndarray, jumps: np.ndarray, what: str, fine: str, curve: np.ndarray, dots: dict[str, tuple]) -> Any:
+    """Draw dots by name, colour and marker over a grey curve; of several kinds, those beyond its range lie on the edge."""
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=_SIZE)
+    axis.plot(x, curve, color="#8b94a1", lw=1.4, label=fine)
+    axis.margins(y=1 / 3)
+    low, high = -np.inf, np.inf
+    if len(dots) > 1:  # beside other derivatives the slope sets the range
+        low, high = axis.get_ylim()
+        axis.set_autoscaley_on(False)
+    for name, (values, colour, marker) in dots.items():
+        axis.plot(x, np.clip(values, low, high), marker, color=colour, ms=3, mew=0, label=name, clip_on=False)
+    for place in jumps:
+        axis.axvline(place, color="#8b94a1", lw=1, ls="--")
+    axis.set(xlabel="place on the line, −1 to 1", ylabel=what)
+    figure.legend(loc="outside upper right", ncols=3)
+    return figure

@@ -19,7 +19,6 @@ Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
     "cost", "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
-_COST_STEPS = 100  # of a motion along which a cost is called once
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
@@ -112,7 +111,7 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
 def cost_finding(motions: Motions, mover: Mover) -> Finding:
     """Call the cost once with its derivative, along a random motion that stays finite; useless ones are a fault."""
     rng, motion = np.random.default_rng(0), int(np.argmax(motions.bad_steps < 0))
-    controls = motions.controls[motion, None, :_COST_STEPS]
+    controls = motions.controls[motion, None, :100]  # a cost of long motions may take long
     start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motions.state(motion, 0))
     change = Direction(*[rng.normal(size=x.shape[1:]) for x in (start.qvel, start.qvel, controls)])
     found = mover.move("slope", start, controls, change, [controls.shape[1]])

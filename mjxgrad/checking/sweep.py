@@ -197,8 +197,6 @@ def sweep(
 ) -> Sweep:
     """Measure bias and variance of first, zeroth and α-order gradients over contact stiffness, in a scene of one's own.
 
-    Ctrl-C ends it with the stiffnesses measured so far.
-
     Args:
         source: an MJCF file, or another source for `load_scene`.
         cost: as in `scene_task`.
@@ -207,7 +205,7 @@ def sweep(
         num_samples: rollouts per estimate.
         num_reference: rollouts for the truth.
         seed: seed of all random numbers.
-        log: called with the name of each part as it starts.
+        log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
         **task_settings: start, horizon and contact of `scene_task`.
 
     Raises:

@@ -309,7 +309,6 @@ def bias_variance(
     params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
     function("progress", progress, "done", "total")
-    function("objective_of_softness", objective_of_softness, "softness")
     one_key(key)
     stacked = jax.tree.map(jnp.asarray, softness)
     lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(stacked)}

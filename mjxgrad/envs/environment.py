@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, one_key, real, whole
+from mjxgrad._arrays import one_key, real, whole
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -76,7 +76,6 @@ class Environment(InScene):
     randomisation: Randomisation | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
 
     def __check_init__(self):
-        function("randomisation", self.randomisation, "key", "scene")
         for name in ("frame_skip", "episode_length"):
             whole(name, getattr(self, name))
 

@@ -77,12 +77,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
     """Return a recorded motion, and the names of the columns that do not belong to the scene.
 
-    Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
-    `act:actuator`, readings `sensor:name`. The kind may be left out for a unique name: a joint is then its position, an
-    actuator its control. An element with several numbers takes an index, `qpos:root[0]`, or `qpos[7]` in the whole array. An
-    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers.
-
-    Each signal is weighed by its variation. The motion begins at its first row; missing parts are the scene's pose, at rest.
+    Columns are as `mjxgrad identify --help` tells. An array of an NPZ has one row per time, with one number or all of the
+    element's numbers. Each signal is weighed by its variation. The motion begins at its first row; missing parts are the
+    scene's pose, at rest.
 
     Args:
         scene: the recorded scene.

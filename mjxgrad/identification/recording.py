@@ -50,9 +50,12 @@ class Recording:
             instance(f"{name} of {self.name}", getattr(self, name), Mapping, 'a dict by signal, such as {"qpos": ...}')
         rows = {name: np.asarray(real(f"{name} of {self.name}", value), float) for name, value in self.measured.items()}
         for name in ("controls", "times", "control_times"):
-            value = getattr(self, name)
-            if value is not None and not (np.ndim(value) and np.isfinite(real(f"{name} of {self.name}", value)).all()):
+            if (value := getattr(self, name)) is None:
+                continue
+            if not (np.ndim(value) and np.isfinite(real(f"{name} of {self.name}", value)).all()):
                 raise ValueError(f"{name} of {self.name} must be finite, one row per time, got {value}")
+            if name != "controls" and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
+                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
         if len(lengths) != 1 or 0 in lengths:
@@ -63,10 +66,6 @@ class Recording:
             raise ValueError(
                 f"measured of {self.name} must have {needed}, or times, got {max(lengths)}: NaN fills gaps"
             )
-        for name in ("times", "control_times"):
-            value = getattr(self, name)
-            if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
-                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
         instance(f"start of {self.name}", self.start, State | None, "of mg.initial_state")
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")

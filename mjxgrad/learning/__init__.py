@@ -2,8 +2,7 @@
 
 from mjxgrad.learning.evaluate import Evaluation, evaluate
 from mjxgrad.learning.learn import Learned, learn
-from mjxgrad.learning.learner import Learner, Policy
-from mjxgrad.learning.settings import Settings
+from mjxgrad.learning.learner import Learner, Policy, Settings
 from mjxgrad.loop.run import Log
 
 __all__ = ["Evaluation", "Learned", "Learner", "Log", "Policy", "Settings", "evaluate", "learn"]

@@ -53,7 +53,6 @@ def evaluate(
         ValueError: if there are no episodes, or no such engine.
     """
     num_episodes = whole("num_episodes", num_episodes)
-    instance("environment", environment, Environment, "of mg.envs.Environment")
     instance("policy", policy, Callable, "a function of an observation")
     one_key(key)
     judge = environment if engine == "mjx" else environment.with_contact(Discrete(engine))

@@ -28,8 +28,7 @@ from jaxtyping import Array, Float, Key, UInt32
 from mjxgrad._arrays import instance, whole
 from mjxgrad._text import Printed, format_range
 from mjxgrad.envs import Environment
-from mjxgrad.learning.learner import ActorCritic, Learner, Policy
-from mjxgrad.learning.settings import Settings
+from mjxgrad.learning.learner import ActorCritic, Learner, Policy, Settings
 from mjxgrad.loop.run import Log, run, side_by_side
 
 

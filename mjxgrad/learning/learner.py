@@ -5,6 +5,7 @@ Another learner is another file like this one: a carry with everything that an u
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,11 +14,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
+from mjxgrad._arrays import instance, real, whole
 from mjxgrad.batched import over_devices
+from mjxgrad.batched.device import is_gpu
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.learning.mixing import Halves, Products
 from mjxgrad.learning.networks import FINAL_SCALE, Network, Normaliser, ValueFunction
-from mjxgrad.learning.settings import Settings
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, window_gradients
 from mjxgrad.loop.run import Method
 
@@ -25,6 +27,75 @@ Metrics = dict[str, Float[Array, ""]]
 _CRITIC_TRACE = 0.95  # λ of the value function's targets
 _TARGET_RATE = 0.8  # share by which the target value function follows the value function
 _LARGEST_NORM = 1.0  # to which gradients are clipped
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """The settings of a learner; the defaults taught ants and hoppers, with 64 environments as with 1024.
+
+    Attributes:
+        num_environments: number of environments side by side: 64, or 1024 on a GPU, which takes little longer for them.
+        window: steps of each environment per update.
+        discount: discount per step.
+        trace: λ of the returns that the policy climbs, see `window`: 1 differentiates through the whole window (SHAC), 0 through
+            one step and the value function after it.
+        alpha: weight of first order, from 0 to 1: 1 is SHAC, 0 has no derivatives. None takes that of the least error in each
+            update, see `mixing`: α-order.
+        stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
+        actor_layers: hidden sizes of the policy.
+        actor_scale: factor of the initial gains of the policy's hidden layers.
+        critic_layers: hidden sizes of the value function.
+        actor_rate: learning rate of the policy, which decreases linearly to zero.
+        actor_decay: factor of the policy's rate per update, in place of the linear decrease; None for the latter.
+        critic_rate: learning rate of the value function, which decreases linearly to zero.
+        critic_iterations: passes over a window's states per update.
+        critic_batches: number of batches in a pass.
+        largest_sample: largest norm of the first-order gradient of one environment's step; longer ones are shortened. The
+            unit is the root mean square of the zeroth-order gradient over environments: 0.1 limits the first-order variance
+            to a hundredth of the zeroth-order one. Infinity shortens none.
+        has_critic: whether a value function estimates the rewards after a window; otherwise they are left out, and `trace`
+            must be 1.
+    """
+
+    num_environments: int = dataclasses.field(default_factory=lambda: 1024 if is_gpu() else 64)
+    window: int = 16
+    discount: float = 0.99
+    trace: float = 0.9
+    alpha: float | None = None
+    stddev: tuple[float, float] = (0.4, 0.25)
+    actor_layers: tuple[int, ...] = (128, 64, 32)
+    actor_scale: float = 1.0
+    critic_layers: tuple[int, ...] = (64, 64)
+    actor_rate: float = 1e-3
+    actor_decay: float | None = None
+    critic_rate: float = 5e-4
+    critic_iterations: int = 16
+    critic_batches: int = 4
+    largest_sample: float = 0.1
+    has_critic: bool = True
+
+    def __post_init__(self):
+        for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
+            whole(name, getattr(self, name))
+        for name in ("actor_scale", "actor_rate", "critic_rate", "largest_sample"):
+            if not real(name, getattr(self, name)) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("actor_layers", "critic_layers"):
+            instance(name, getattr(self, name), Sequence, "a tuple of hidden sizes, such as (64, 64)")
+        if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
+            raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
+        for name in ("discount", "trace", *(["alpha"] if self.alpha is not None else [])):
+            if not 0 <= real(name, getattr(self, name)) <= 1:
+                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        if self.trace < 1 and not self.has_critic:
+            raise ValueError(
+                f"trace must be 1 without a value function, got {self.trace}: there is nothing to blend with"
+            )
+        if (self.num_environments * self.window) % self.critic_batches:
+            raise ValueError(
+                f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
+                f"got {self.critic_batches}"
+            )
 
 
 class Policy(eqx.Module):

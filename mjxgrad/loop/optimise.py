@@ -101,13 +101,10 @@ class GradientStep(Descent):
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
-        named = "a function such as functools.partial(mg.estimators.alpha_order, num_samples=64)"
-        instance("estimator", self.estimator, Callable, named)
         function("estimator", self.estimator, "objective", "params", "key")
-        if not isinstance(self.optimiser, optax.GradientTransformation):
-            raise ValueError(
-                f"optimiser must be of optax, with its settings, such as optax.adam(1e-2), got {self.optimiser!r}"
-            )
+        instance(
+            "optimiser", self.optimiser, optax.GradientTransformation, "of optax with its settings, as optax.adam(1e-2)"
+        )
 
     def init_state(self, params: Vector) -> PyTree:
         return jax.tree.map(jnp.asarray, self.optimiser.init(params))

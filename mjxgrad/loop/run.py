@@ -5,7 +5,6 @@ A method is two functions, from a start to a carry and from a carry to the next;
 
 import functools
 import math
-import os
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -129,7 +128,7 @@ def run(
         ValueError: if the checkpoint has no folder, is damaged, or from a run with another program, arrays or start.
     """
     function("log", log, "step", "metrics")
-    instance("checkpoint", checkpoint, str | os.PathLike | None, "the path of a file")
+    instance("checkpoint", checkpoint, str | Path | None, "the path of a file")
     checkpoint = None if checkpoint is None else Path(checkpoint)
     if checkpoint is not None and not checkpoint.parent.is_dir():
         raise ValueError(

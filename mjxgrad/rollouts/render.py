@@ -20,7 +20,6 @@ from mjxgrad._text import write
 from mjxgrad.scene import Scene
 
 Number = int | float
-_CHOICES = ("egl", "glfw", "osmesa")  # of MUJOCO_GL
 # (frames, height, width, 3)
 Frames = UInt8[np.ndarray, "_ _ _ 3"]
 
@@ -194,8 +193,8 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> "mujoco.Rend
     except Exception as error:
         reason = str(error).partition(",")[0] or type(error).__name__
         chosen = os.environ.get("MUJOCO_GL", "")
-        if chosen and chosen.lower().strip() not in _CHOICES:
-            told = f"rendering needs MUJOCO_GL to be one of {', '.join(_CHOICES)}, or unset, got {chosen}"
+        if chosen and chosen.lower().strip() not in ("egl", "glfw", "osmesa"):
+            told = f"rendering needs MUJOCO_GL to be one of egl, glfw, osmesa, or unset, got {chosen}"
             raise RenderingUnavailableError(told) from None
         alone = f" MUJOCO_GL={chosen} was tried alone: unset it and the others are, too." if chosen else ""
         raise RenderingUnavailableError(

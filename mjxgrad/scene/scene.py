@@ -28,9 +28,7 @@ from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
 _OPTIONS = ("timestep", "gravity", "wind")
-_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pair_friction", "timestep"} | {
-    f"dof_{name}" for name in ("armature", "frictionloss")
-}
+_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pair_friction", "dof_armature", "timestep"}
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
@@ -119,12 +117,11 @@ class Scene(eqx.Module):
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
         # Not jnp, which jit would trace.
-        known = {name: np.asarray(value).min(initial=np.inf) for name, value in changed.items() if is_known(value)}
-        for name, least in known.items():
-            if np.isnan(least):
-                raise ValueError(f"{name} must hold numbers, got NaN")
-            if name in _NOT_NEGATIVE and not np.isfinite(np.asarray(changed[name])).all():
-                raise ValueError(f"{name} must be finite, got inf")
+        known = {name: np.asarray(value) for name, value in changed.items() if is_known(value)}
+        for name, numbers in known.items():
+            least, most = numbers.min(initial=np.inf), numbers.max(initial=0)
+            if np.isnan(least) or (name in _NOT_NEGATIVE and most == np.inf):
+                raise ValueError(f"{name} must hold numbers, got {'NaN' if np.isnan(least) else 'infinity'}")
             if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
                 raise ValueError(f"{name} must {requirement}, got {least:g}")
