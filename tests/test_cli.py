@@ -242,7 +242,10 @@ def test_a_program_is_short_starts_at_the_key_frame_and_holds_no_code_of_a_file_
     assert "mg.initial_state(scene, keyframe='home')" in program
 
 
-@pytest.mark.parametrize("command", [["-m", "mjxgrad", "check", "scene.xml"], ["-c", "import mjxgrad"]])
+@pytest.mark.parametrize(
+    "command",
+    [["-m", "mjxgrad", "check", "scene.xml"], ["-m", "experiments", "run", "ramp"], ["-c", "import mjxgrad"]],
+)
 def test_a_switch_of_jax_that_is_no_switch_is_said_in_one_line(scene, command):
     environment = {**os.environ, "JAX_ENABLE_X64": "maybe", "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
