@@ -84,8 +84,14 @@ def main(arguments: list[str] | None = None) -> int:
     interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
     interruptions: list[int] = []
+
+    def interrupt(number: int, frame: Any) -> None:
+        interruptions.append(number)
+        os.write(2, b"interrupted: what has begun is completed first\n")  # may take long
+        signal.default_int_handler(number, frame)
+
     for number in (signal.SIGINT, signal.SIGTERM):  # SIGTERM is handled like Ctrl-C
-        signal.signal(number, lambda *given: interruptions.append(given[0]) or signal.default_int_handler(*given))
+        signal.signal(number, interrupt)
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
         if interruptions:  # the library has returned what was measured
@@ -234,9 +240,8 @@ def identify(
     motions = []
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path))
-        gap = one.times[-1] / (len(one.times) - 1) / loaded.mj_model.opt.timestep
-        if gap > 200:  # milliseconds, perhaps
-            log(f"rows of {path} are {gap:.0f} time steps of the scene apart: is its time in seconds?")
+        if one.times[-1] > 200 * (len(one.times) - 1) * loaded.mj_model.opt.timestep:  # milliseconds, perhaps
+            log(f"rows of {path} are over 200 time steps of the scene apart: is its time in seconds?")
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
         motions.append(one)

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad import _arrays
+from mjxgrad._arrays import function as check_function
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -76,8 +76,7 @@ def parameter_noise(
     if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
     dim = width.shape[0] if width.ndim == 1 else dim
-    _arrays.function("function", function, "params")
-    dim = None if dim is None else _arrays.whole("dim", dim)
+    check_function("function", function, "params")
     return ParameterNoise(function=as_pytree(function), stddev=width, dim=dim)
 
 

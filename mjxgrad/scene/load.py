@@ -79,7 +79,6 @@ def load_scene(
     """
     if softness is not None:
         instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
-    instance("keep_everything", keep_everything, bool, "True or False")
     if max_contacts is not None and whole("max_contacts", max_contacts, None) < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:
