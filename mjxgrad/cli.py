@@ -85,13 +85,13 @@ def main(arguments: list[str] | None = None) -> int:
     """
     interruptions: list[int] = []
 
-    def interrupt(number: int, frame: Any) -> None:
-        interruptions.append(number)
+    def interrupt(*given: Any) -> None:
+        interruptions.append(given[0])
         os.write(2, b"interrupted: what has begun is completed first\n")  # may take long
-        signal.default_int_handler(number, frame)
+        signal.default_int_handler(*given)
 
-    for number in (signal.SIGINT, signal.SIGTERM):  # SIGTERM is handled like Ctrl-C
-        signal.signal(number, interrupt)
+    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
         if interruptions:  # the library has returned what was measured

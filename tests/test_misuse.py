@@ -370,7 +370,6 @@ FOUND = {
     "mg.parameter_noise(3, 0.1)": "function must be a function of params, got int",
     "mg.parameter_noise(0.1, lambda x: x @ x)": "stddev must be real numbers, got function",
     "mg.parameter_noise(lambda x, y: x @ y, 0.1)": "function must be a function of params, got function: missing",
-    "mg.learning.evaluate(cart, None, key, num_episodes=2)": "policy must be a function of an observation, got NoneType",
     # Keys.
     "optimise(key=None)": "key must come from jax.random.key",
     "optimise(key='0')": "key must come from jax.random.key",
@@ -442,7 +441,6 @@ FOUND = {
     "mg.rollout('scene.xml', state, u)": "scene must be of mg.load_scene, got str",
     "roll(u, 0.1 * u)": "params must belong to a policy, got them beside a sequence of controls: give noise as noise=",
     "roll(u, checkpoint='run.npz')": "checkpoint must be True or False, got str",
-    "roll(u, inputs=[1])": "inputs must be a dict from names to arrays, got list",
     "roll(u, contact=mg.Slope)": "contact must be mg.Discrete(), mg.Slope(), mg.Onset() or mg.Smoothing(), got <class",
     "mg.forward(scene, state)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got Scene",
     "mg.step(scene.mj_model, data)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got MjModel",

@@ -55,7 +55,6 @@ def check_start(scene: Any, state: Any) -> None:
 def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:
     """Return the further inputs of each step; refuse unknown ones."""
     found = {}
-    instance("inputs", {} if inputs is None else inputs, Mapping, "a dict from names to arrays")
     for name, value in ({} if inputs is None else inputs).items():
         if name not in INPUTS[1:]:
             raise ValueError(f"inputs must be among {', '.join(INPUTS[1:])}, got {name!r}")
