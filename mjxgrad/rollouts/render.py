@@ -194,8 +194,7 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> "mujoco.Rend
         reason = str(error).partition(",")[0] or type(error).__name__
         chosen = os.environ.get("MUJOCO_GL", "")
         if chosen and chosen.lower().strip() not in ("egl", "glfw", "osmesa"):
-            told = f"rendering needs MUJOCO_GL to be one of egl, glfw, osmesa, or unset, got {chosen}"
-            raise RenderingUnavailableError(told) from None
+            raise RenderingUnavailableError(f"MUJOCO_GL must be egl, glfw, osmesa or unset, got {chosen}") from None
         alone = f" MUJOCO_GL={chosen} was tried alone: unset it and the others are, too." if chosen else ""
         raise RenderingUnavailableError(
             "rendering needs an OpenGL that works without a display, and none was found: install libosmesa6 (draws on "

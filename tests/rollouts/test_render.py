@@ -150,7 +150,7 @@ def test_a_choice_of_opengl_that_mujoco_does_not_know_is_told_where_it_is_needed
     """MuJoCo alone cannot even be imported under it."""
     environment = {**os.environ, "MUJOCO_GL": "foo"}
     done = subprocess.run([sys.executable, "-c", _DRAWN], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout == "rendering needs MUJOCO_GL to be one of egl, glfw, osmesa, or unset, got foo\n"
+    assert done.stdout == "MUJOCO_GL must be egl, glfw, osmesa or unset, got foo\n"
 
 
 _WITHOUT_OPENGL = """
