@@ -57,7 +57,7 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
         (
             ["check", "scene.xml", "--quick", "--cost", "costs.py:wrong"],
-            "with AttributeError: 'Trajectory' object has no attribute",
+            "'costs.py:wrong' raised AttributeError: 'Trajectory' object",
         ),
         (["check", "scene.xml", "--quick", "--cost", "costs.py:lost"], "costs.py has no function 'lost', but height"),
         (["check", "scene.xml", "--quick", "--cost", "costs.py"], "cost must be file.py:function"),

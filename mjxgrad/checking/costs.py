@@ -67,7 +67,7 @@ def _told(name: str) -> Iterator[None]:
         yield
     except Exception as error:
         forms = "file.py:function, module:function, or of a body as height:torso"
-        raise ValueError(f"cost must be {forms}, got {name!r}, with {type(error).__name__}: {error}") from error
+        raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}; a cost must be {forms}") from error
 
 
 def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
