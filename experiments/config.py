@@ -74,6 +74,8 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
     # tomllib's own error, and Python's on a number of too many digits.
     except ValueError as error:
         told = str(error).replace("Cannot overwrite a value", "a key is given twice")
+        told = told.replace("Invalid value", "invalid value, words need quotes")
+        told = told.replace("Illegal character '\\n'", "a quote is not closed")
         raise ConfigurationError(path.name, [f"not TOML: {told}"]) from None
     except RecursionError:
         raise ConfigurationError(path.name, ["arrays or tables are nested too deeply"]) from None

@@ -171,6 +171,8 @@ def solve_ours(given: Problem) -> Answer:
         recordings.append(one)
     moments = [time.perf_counter()]
     found = mg.identify(scene, unknown, recordings, log=lambda *_: moments.append(time.perf_counter()), **_OURS)
+    if found.stopped is identification.Stopped.INTERRUPTED:
+        raise KeyboardInterrupt
     moments.append(time.perf_counter())
     searching = (moments[-1] - moments[1]) * found.num_steps / max(found.num_steps - 1, 1)
     values, widths = (np.concatenate([np.ravel(x) for x in part.values()]) for part in (found.values, found.half_width))

@@ -23,7 +23,7 @@ from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 from mjxgrad import identification
 from mjxgrad._mjx import mjx
-from mjxgrad.identification import Parameter, Recording
+from mjxgrad.identification import Parameter, Recording, Stopped
 
 
 class StartSettings(SettingsTable):
@@ -332,6 +332,8 @@ def _fit(settings: Settings, names: tuple[str, ...], windows: list[Recording], h
         contact=mg.Onset() if has_onset else mg.Discrete(),
         max_steps=settings.max_steps,
     )
+    if found.stopped is Stopped.INTERRUPTED:
+        raise KeyboardInterrupt
     return Fit(
         values={**values, **{name: float(value) for name, value in found.values.items()}},
         half_width={name: float(width) for name, width in found.half_width.items()},

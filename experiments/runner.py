@@ -233,10 +233,9 @@ def _previous(folder: Path) -> dict[str, Any]:
 
 
 def _set_up_jax(precision: str) -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", precision == "float64")
-    importlib.import_module("mjxgrad").keep_compiled()
+    library = importlib.import_module("mjxgrad")  # first, since it tells of a wrong environment in a sentence
+    importlib.import_module("jax").config.update("jax_enable_x64", precision == "float64")
+    library.keep_compiled()
 
 
 def _folder_name(varied: dict[str, Any]) -> str:

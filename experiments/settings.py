@@ -71,7 +71,25 @@ class OwnScene(SettingsTable):
     def _is_whole(self) -> Self:
         if self.scene is None and (given := self.model_fields_set & {"cost", "start", "horizon"}):
             raise ValueError(f"{', '.join(sorted(given))}: of a scene of one's own; give scene its file, too")
-        for file in (self.scene, (self.cost or "").rpartition(":")[0]):
-            if file and file.endswith((".xml", ".py")) and not Path(file).is_file():
-                raise ValueError(f"{'scene' if file == self.scene else 'cost'}: there is no file {file}")
+        if self.scene is not None and not Path(self.scene).is_file():
+            raise ValueError(f"scene: there is no file {self.scene!r}")
+        if self.cost is not None:
+            _check_cost(self.cost)
         return self
+
+
+def _check_cost(cost: str) -> None:
+    """Refuse the name of a cost whose file is missing, is no Python, or has no such function; the file is not run."""
+    source, _, function = cost.rpartition(":")
+    if not source:
+        raise ValueError(f"cost: must be file.py:function, module:function or height:body, got {cost!r}")
+    if not source.endswith(".py"):
+        return
+    if not Path(source).is_file():
+        raise ValueError(f"cost: there is no file {source}")
+    try:
+        names = compile(Path(source).read_text(encoding="utf-8"), source, "exec").co_names
+    except (SyntaxError, ValueError) as error:
+        raise ValueError(f"cost: {source} is not Python: {error}") from error
+    if function not in names:
+        raise ValueError(f"cost: {source} has no function {function!r}, but {', '.join(names) or 'none'}")

@@ -1,5 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
+from mjxgrad import _mjx  # noqa: F401  # isort: skip
 from mjxgrad import baselines, diagnostics, envs, estimators, identification, learning, planning, tasks
 from mjxgrad._programs import keep_compiled
 from mjxgrad.batched import over_devices

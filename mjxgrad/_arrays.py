@@ -1,5 +1,6 @@
 """Known values of traced arrays, and checks of arguments."""
 
+import inspect
 import operator
 from typing import Any
 
@@ -9,9 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def as_float(value: Any) -> Any:
+def as_float(value: Any, name: str = "softness") -> Any:
     """Return numbers as an array of floats, also integers (10000 is a natural stiffness); None stays None."""
-    return None if value is None else jnp.asarray(value, dtype=jnp.result_type(float))
+    return None if value is None else real(name, value, jnp.result_type(float))
+
+
+def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
+    """Return real numbers as an array; refuse text, objects and ragged lists."""
+    try:
+        kind = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
+    except jax.errors.TracerArrayConversionError:  # a list of traced numbers
+        kind = jnp.asarray(value).dtype
+    except (TypeError, ValueError):
+        kind = np.dtype(object)
+    if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
+        raise ValueError(f"{name} must be real numbers, got {type(value).__name__ if kind.kind in 'OU' else kind}")
+    return jnp.asarray(value, dtype)
 
 
 def known(values: Any) -> np.ndarray | None:
@@ -46,10 +60,22 @@ def whole(name: str, value: Any, least: int | None = 1) -> int:
     return number
 
 
-def instance(name: str, value: Any, kind: type, wanted: str) -> None:
+def instance(name: str, value: Any, kind: Any, wanted: str) -> None:
     """Refuse a value of another type."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
+
+
+def function(name: str, value: Any, *arguments: str) -> None:
+    """Refuse what is neither a function of these arguments nor None."""
+    try:
+        if value is not None:
+            inspect.signature(value).bind(*arguments)
+    except TypeError as error:
+        wanted = f"{name} must be a function of {' and '.join(arguments)}"
+        raise ValueError(f"{wanted}, got {type(value).__name__}: {error}") from None
+    except ValueError:  # a function of C without a signature
+        return
 
 
 def form(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""The only import of MJX.
+"""The first import of JAX and MuJoCo, where a wrong variable of the environment ends in a sentence; the only one of MJX.
 
 `mujoco.mjx` prints two lines to stdout if NVIDIA Warp is absent, which this library does not use.
 A library must not print, and stdout may carry a program's results. Only those two lines are
@@ -9,7 +9,27 @@ dropped; other output of the import is passed on.
 import contextlib
 import importlib.metadata
 import io
+import os
 import sys
+
+try:
+    importlib.import_module("jax")
+except ValueError as error:
+    _told = f"JAX refuses the environment: {error}; JAX's switches are true or false, 1 or 0"
+    if not sys.argv[0].endswith(("-m", "mjxgrad")):
+        raise ValueError(_told) from None
+    print(_told, file=sys.stderr)  # the command line
+    sys.exit(2)
+try:
+    importlib.import_module("mujoco")
+except Exception:  # MuJoCo and PyOpenGL raise errors without a common class
+    # Where an OpenGL that is chosen fails, MuJoCo is imported without any, and `render` tells of it when it is needed.
+    _chosen, os.environ["MUJOCO_GL"] = os.environ.get("MUJOCO_GL", "off"), "off"
+    importlib.import_module("mujoco")
+    os.environ["MUJOCO_GL"] = _chosen
+    # The first attempt's modules are not imported again, and would not be found as attributes.
+    for _name in [name for name in sys.modules if name.startswith("mujoco.") and name.count(".") == 1]:
+        setattr(sys.modules["mujoco"], _name.partition(".")[2], sys.modules[_name])
 
 _NOISE = ("Failed to import warp:", "Failed to import mujoco_warp:")
 

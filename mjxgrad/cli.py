@@ -62,6 +62,9 @@ mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 '''
 
 
+Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
+
+
 class CommandError(Exception):
     """A request that cannot be carried out; the message is a sentence for the user."""
 
@@ -78,12 +81,22 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
 
     The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
-    interruption. Once it measures derivatives an interrupted `check` prints the verdict so far.
+    interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
-    # SIGTERM is handled like Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    interruptions: list[int] = []
+
+    def interrupt(*given: Any) -> None:
+        interruptions.append(given[0])
+        os.write(2, b"interrupted: what has begun is completed first\n")  # may take long
+        signal.default_int_handler(*given)
+
+    signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)
     try:
-        return app(arguments, exit_on_error=False, print_error=False) or 0
+        status = app(arguments, exit_on_error=False, print_error=False) or 0
+        if interruptions:  # the library has returned what was measured
+            raise KeyboardInterrupt
+        return status
     except KeyboardInterrupt:
         _say("interrupted")
         return 130
@@ -116,7 +129,7 @@ def check(
     html: Path | None = None,
     quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     budget: float = 12.0,
-    seed: int = 0,
+    seed: Whole = 0,
 ) -> int:
     """Check whether and how a scene can be differentiated; the exit status is 1 where there are faults.
 
@@ -124,7 +137,7 @@ def check(
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; or height:body and others, see `sweep`.
         html: write a page to this file.
-        quick: only fast checks, in seconds: contact, time step, parts without effect.
+        quick: only fast checks, in seconds: contact, time step, parts without effect, one value and derivative of the cost.
         budget: duration in s once the scene is loaded; the report names measurements that are left out.
         seed: seed of all random numbers.
     """
@@ -144,13 +157,13 @@ def sweep(
     *,
     cost: str | None = None,
     start: str | None = None,
-    horizon: int | None = None,
+    horizon: Whole | None = None,
     stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
     noise: float = 0.1,
-    samples: int = 256,
+    samples: Whole = 256,
     gradient: Literal["slope", "discrete"] = "slope",
     engine: Literal["mjx", "mujoco"] | None = None,
-    seed: int = 0,
+    seed: Whole = 0,
     html: Path = Path("sweep.html"),
 ) -> None:
     """Measure bias and variance of first, zeroth and α-order gradients of a scene, over contact stiffness.
@@ -222,9 +235,13 @@ def identify(
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     loaded = mg.load_scene(_existing(scene), keep_everything=True)
     wanted = {text.partition("=")[0]: files.parameter(loaded, text) for text in parameter}
+    if len(wanted) < len(parameter):
+        raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
     motions = []
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path))
+        if one.times[-1] > 200 * (len(one.times) - 1) * loaded.mj_model.opt.timestep:  # milliseconds, perhaps
+            log(f"rows of {path} are over 200 time steps of the scene apart: is its time in seconds?")
         if unknown:
             log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
         motions.append(one)

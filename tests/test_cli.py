@@ -1,6 +1,7 @@
 """The command line: what it prints where, its exit codes, and what it writes."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,9 +12,19 @@ import mjxgrad as mg
 from mjxgrad import cli
 from tests.processes import ROOT
 
-SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/><body pos="0 0 .2">
+SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/><body name="ball" pos="0 0 .2">
   <joint name="z" type="slide" axis="0 0 1"/><geom size=".05" mass=".2"/></body></worldbody>
   <actuator><motor name="push" joint="z" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
+COSTS = """import jax.numpy as jnp
+def height(trajectory):
+    return trajectory.qpos[-1, 0] ** 2
+def count(trajectory):
+    return jnp.sum(trajectory.qpos > 0)
+def root(trajectory):
+    return jnp.sqrt(0 * trajectory.qpos[-1, 0])
+def wrong(t): return t.pos
+"""
+_IDENTIFY = ["identify", "scene.xml", "motion.csv", "--parameter", "mass:ball"]
 
 
 @pytest.fixture
@@ -45,6 +56,26 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
         (["check", "refused.xml"], "got none (nv = 0)"),
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
         (
+            ["check", "scene.xml", "--quick", "--cost", "costs.py:wrong"],
+            "'costs.py:wrong' raised AttributeError: 'Trajectory' object",
+        ),
+        (["check", "scene.xml", "--quick", "--cost", "costs.py:lost"], "costs.py has no function 'lost', but height"),
+        (["check", "scene.xml", "--quick", "--cost", "costs.py"], "cost must be file.py:function"),
+        (["check", "scene.xml", "--quick", "--cost", "scene.xml:cost"], "cost must be file.py:function"),
+        (["check", "scene.xml", "--quick", "--seed", "1.5"], "invalid literal for int() with base 10: '1.5'"),
+        (["sweep", "scene.xml", "--samples", "1.5"], "invalid literal for int() with base 10: '1.5'"),
+        (["sweep", "scene.xml", "--samples", "0"], "num_samples must be at least 2, got 0"),
+        (["sweep", "scene.xml", "--horizon", "-1"], "horizon must be at least 1, got -1"),
+        (["sweep", "scene.xml", "--start", "home"], "keyframe must be one of none in this scene, got 'home'"),
+        ([*_IDENTIFY, "mass:ball=1..2"], "--parameter must name each parameter once"),
+        ([*_IDENTIFY[:2], "twice.csv", *_IDENTIFY[3:]], "z stands there more than once"),
+        (
+            [*_IDENTIFY[:2], "text.npz", *_IDENTIFY[3:]],
+            "text.npz must be an NPZ with arrays of numbers: it is no archive",
+        ),
+        ([*_IDENTIFY[:4], "mass:ball=2..1"], "bounds of mass must be two numbers that increase"),
+        ([*_IDENTIFY[:4], "mass:bal"], "there is no body 'bal'; named bodies are 'world', 'ball'"),
+        (
             ["check", "scene.xml", "--quick", "--cost", "height:nobody"],
             "there is no body or site 'nobody' in the scene",
         ),
@@ -54,9 +85,28 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
 )
 def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said):
     Path("refused.xml").write_text("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
+    Path("costs.py").write_text(COSTS)
+    Path("motion.csv").write_text("time,z,push\n0,0,0\n.1,0,0\n")
+    Path("twice.csv").write_text("time,z,z,push\n0,0,0,0\n")
+    Path("text.npz").write_text("text")
     assert cli.main(arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    *_, line = capsys.readouterr().err.splitlines()
     assert said in line
+    assert "Traceback" not in line
+
+
+@pytest.mark.parametrize(
+    ("cost", "code", "said"),
+    [
+        ("height", 0, "- The cost is "),
+        ("count", 1, "its derivative along a change 0."),
+        ("root", 1, "its derivative along a change nan."),
+    ],
+)
+def test_a_quick_check_calls_the_cost_once_with_its_derivative(scene, capsys, cost, code, said):
+    Path("costs.py").write_text(COSTS)
+    assert cli.main(["check", scene, "--quick", "--cost", f"costs.py:{cost}"]) == code
+    assert said in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_full_disk_costs_neither_the_answer_nor_what_was_there(scene, capsys, monkeypatch):
@@ -80,6 +130,51 @@ def test_an_interruption_ends_in_one_line(scene, capsys, monkeypatch):
     monkeypatch.setattr(mg, "check", interrupted)
     assert cli.main(["check", scene]) == 130
     assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.fixture
+def signals():
+    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+_SHORT = ["--samples", "4", "--horizon", "20", "--engine", "mujoco"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "at", "said"),
+    [
+        (
+            ["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"],
+            "1 of 3",
+            "Interrupted: 2 of 3 stiffnesses are left out.",
+        ),
+        (
+            ["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"],
+            "2 of 3",
+            "Interrupted: 1 of 3 stiffnesses are left out.",
+        ),
+        ([*_IDENTIFY[:4], "gear:push"], "step 1:", "The search was interrupted: do not trust the values."),
+        (["check", "scene.xml"], "derivatives over", "Derivatives were not measured"),
+    ],
+)
+def test_an_interrupted_command_prints_and_writes_what_it_has_measured(
+    signals, tmp_path, capsys, monkeypatch, arguments, at, said
+):
+    """The signal comes when the command tells of its progress."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.xml").write_text(SCENE.format(gear=1))
+    rows = "".join(f"{0.01 * i},{1e-4 * i * i},1\n" for i in range(20))
+    Path("motion.csv").write_text(f"time,z,push\n{rows}")
+    monkeypatch.setattr(cli, "_timed", lambda: lambda text: text.startswith(at) and signal.raise_signal(signal.SIGINT))
+    assert cli.main(arguments) == 130
+    told = capsys.readouterr()
+    assert said in told.out
+    assert told.err.endswith("interrupted\n")
+    assert Path("sweep.html").exists() == (arguments[0] == "sweep")
+    assert Path("identified/report.html").exists() == (arguments[0] == "identify")
 
 
 def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatch):
@@ -110,7 +205,6 @@ def test_a_new_program_moves_the_scene_and_films_it(scene):
 
 
 _PAGE = "a page needs jinja2, not installed: pip install 'mjxgrad[render]'\n"
-_IDENTIFY = ["identify", "scene.xml", "motion.csv", "--parameter", "mass:ball"]
 
 
 @pytest.mark.parametrize(
@@ -141,6 +235,20 @@ def test_a_program_is_short_starts_at_the_key_frame_and_holds_no_code_of_a_file_
     assert "stop" not in compile(program, "task.py", "exec").co_names
     assert len(program.splitlines()) <= 40
     assert "mg.initial_state(scene, keyframe='home')" in program
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["-m", "mjxgrad", "check", "scene.xml"], ["-m", "experiments", "run", "ramp"], ["-c", "import mjxgrad"]],
+)
+def test_a_switch_of_jax_that_is_no_switch_is_said_in_one_line(scene, command):
+    environment = {**os.environ, "JAX_ENABLE_X64": "maybe", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
+    *before, line = done.stderr.splitlines()
+    assert "JAX_ENABLE_X64" in line
+    assert line.endswith("JAX's switches are true or false, 1 or 0")
+    assert not any("jax/" in one for one in before)
+    assert len(before) == 0 or command[0] == "-c"
 
 
 def test_a_platform_that_is_not_there_is_said_in_one_line(scene):

@@ -7,8 +7,8 @@ import pytest
 from tests.processes import run_python
 
 SETUP = """
-import functools, json, sys, tempfile
-import equinox as eqx, jax, jax.numpy as jnp, numpy as np, optax
+import functools, json, sys, tempfile, warnings
+import equinox as eqx, jax, jax.numpy as jnp, mujoco, numpy as np, optax
 import mjxgrad as mg
 from mjxgrad import diagnostics, envs, estimators, identification as fit, planning
 from mjxgrad.estimators import rules
@@ -88,6 +88,20 @@ def decided(state=(0.0, 0.0), **how):
 
 
 five, wrong = np.zeros(5), np.zeros((3, 1))
+data, u = mujoco.MjData(scene.mj_model), jnp.zeros((2, 1))
+course = mg.SceneTask(scene, state, lambda trajectory: trajectory.qpos[-1, 0], 2)
+hinged = mg.load_scene("<mujoco><worldbody><body><joint name='h' range='-90 90'/><geom size='.1'/></body></worldbody></mujoco>")
+
+
+def learn(key=key, environment=None, **how):
+    return mg.learning.learn(environment or cart, key, **{"num_updates": 1} | how)
+
+
+def warned(call, *arguments, **how):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        call(*arguments, **how)
+    raise told[0].message
 
 
 def identify(measured=five, recordings=None, **how):
@@ -115,7 +129,7 @@ def answer(call):
 print(json.dumps({call: answer(call) for call in json.loads(sys.argv[1])}))
 """
 FOUND = {
-    "first(objective=lambda x: x @ x)": "objective must be an Objective, got function; wrap a function by mg.parameter_noise",
+    "first(objective=lambda x: x @ x)": "objective must be an Objective (wrap a function by mg.parameter_noise",
     "first(cost=lambda x: {'cost': x @ x})": "function must return one number, got dict",
     "first(cost=lambda x: x)": "function must return a scalar of shape (), got shape (2,)",
     "first(count=2.5)": "num_samples must be a whole number, got 2.5",
@@ -124,12 +138,13 @@ FOUND = {
     "first(key=jax.random.split(key, 3))": "key must be one of jax.random.key, got an array of shape (3,)",
     "estimators.alpha_order(noisy, params, key, num_samples=8, rule='consistent')": "rule must be one of mg.estimators.rules",
     "estimators.rules.FixedAlpha(3.0)": "alpha must be from 0 to 1, got 3.0",
-    "optimise(annealing=0.5)": "annealing must be a schedule from step to scale, got 0.5; for a fixed scale",
-    "optimise(estimator='first_order')": "estimator must be a function such as functools.partial(",
+    "optimise(annealing=0.5)": "annealing must be a function of step, got float",
+    "optimise(estimator='first_order')": "estimator must be a function of objective and params and key, got str",
     "optimise(estimator=lambda objective, params, key: params)": "estimator must return a GradientEstimate, got",
-    "optimise(optimiser=optax.adam)": "optimiser must be of optax, with its settings, such as optax.adam(1e-2), got <function",
+    "optimise(optimiser='adam')": "optimiser must be of optax with its settings, as optax.adam(1e-2), got str",
+    "optimise(optimiser=optax.adam)": "optimiser must be of optax with its settings, as optax.adam(1e-2), got function",
     "optimise(num_steps=2.5)": "num_steps must be a whole number, got 2.5",
-    "optimise(key=0)": "key must come from jax.random.key, with at most one leading axis, got int32 of shape ()",
+    "optimise(key=0)": "key must come from jax.random.key, with at most one leading axis, got int64 of shape ()",
     "optimise(at=jnp.array([1.0, jnp.nan]))": "params must be finite at the start, got [ 1. nan]",
     "jax.jit(lambda x: optimise(at=x))(params)": "optimise must be called outside of jax.jit and jax.vmap",
     "optimise(checkpoint=archive)": "checkpoint must be a file that a run has saved, got ",
@@ -221,7 +236,7 @@ FOUND = {
     "optimise(checkpoint='/nowhere/at/all.npz')": "checkpoint must be in a folder that exists",
     "optimise(at=jnp.zeros((3, 2)), key=jax.random.split(key, 4))": "params must have a leading axis only where key has the same",
     "optimise(at=jnp.zeros(()))": "params must be a vector of shape",
-    "optimise(objective=lambda x: x @ x)": "objective must be an Objective, got function; wrap a function by",
+    "optimise(objective=lambda x: x @ x)": "objective must be an Objective (wrap a function by",
     "elite(9)": "num_elite must be at least 2 and at most num_samples = 8, got 9",
     "elite(2, stddev=-0.1)": "stddev must be positive",
     "elite(2, stddev=jnp.ones(3))": "stddev must be one number or 2",
@@ -278,6 +293,7 @@ FOUND = {
     "cart.refined(0)": "times must be at least 1, got 0",
     "mg.render.write_video('no/such/v.mp4', np.zeros((2, 4, 4, 3), np.uint8))": "in an existing folder, got no/such/v.mp4",
     "roll(jnp.zeros((3, 1), complex))": "controls must be real numbers, got complex",
+    "roll('abc')": "controls must be real numbers, got str",
     "mg.learning.learn([], key, num_updates=1)": "environment must be one mg.envs.Environment or several, got []",
     "mg.learning.Settings(window=0)": "window must be at least 1, got 0",
     "mg.learning.Settings(stddev=(0.1, 0.0))": "stddev must be positive",
@@ -285,11 +301,13 @@ FOUND = {
     "mg.learning.Settings(has_critic=False)": "trace must be 1 without a value function, got 0.9",
     # Arguments of another kind, or in another place.
     "mg.linearise(scene, state, jnp.zeros(3))": "controls must have shape (1, 1), one row per step",
-    "mg.step(scene, state)": "a step takes MJX's model and data, as scene.model and scene.data, got Scene and State",
+    "mg.step(scene, state)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got Scene",
+    "mg.check_stability(scene.model)": "scene must be of mg.load_scene, got Model",
     "mg.check(balls, lambda trajectory: trajectory.qpos)": "a scalar of shape () or one number per state, shape (",
-    "mg.check(balls, 3)": "a cost or policy must be a function, got 3",
+    "mg.check(balls, 3)": "cost must be a function of trajectory, got int",
     "mg.check(balls, seed=-3)": "seed must be at least 0, got -3",
     "mg.sweep(balls.mj_model, noise=0.0)": "noise must be positive and finite, got 0.0",
+    "mg.SceneTask(scene, state, 3, 2)": "cost must be a function of trajectory, got int",
     "identify(recordings=fit.Recording({'qpos': five}))": "recordings must hold at least one, in a list, got a recording",
     "identify(recordings=['a.csv'])": "recordings must be of mg.identification.Recording, got str",
     "mg.identify(scene, {'a': 1.0}, [fit.Recording({'qpos': five})])": "parameters must be of mg.identification, such as",
@@ -304,6 +322,138 @@ FOUND = {
         "stage_weight must be one number or have shape (2,), got (3,)",
     "mg.render.frames(scene, roll(horizon=2))": "qpos must be positions, got a trajectory: give its .qpos",
     "mg.render.write_video('v.mp4', np.zeros((2, 4)))": "video must have shape (frames, height, width, 3), got (2, 4)",
+    # Functions: none, in place of a path, or of other arguments.
+    "optimise(log=3)": "log must be a function of step and metrics, got int",
+    "optimise(log='run.log')": "log must be a function of step and metrics, got str",
+    "optimise(log=lambda metrics: None)": "log must be a function of step and metrics, got function: too many positional",
+    "optimise(evaluate=3)": "evaluate must be a function of params, got int",
+    "optimise(annealing='linear')": "annealing must be a function of step, got str",
+    "optimise(estimator=estimators.first_order)": "missing a required argument: 'num_samples'",
+    "optimise(estimator=functools.partial(estimators.first_order, num_samples=4, seed=0))": "unexpected keyword argument 'seed'",
+    "learn(log=3)": "log must be a function of step and metrics, got int",
+    "learn(log=lambda: None)": "log must be a function of step and metrics, got function",
+    "identify(log=3)": "log must be a function of step and metrics, got int",
+    "mg.check(balls, log=3)": "log must be a function of text, got int",
+    "mg.sweep(balls, log=3)": "log must be a function of text, got int",
+    "measured(progress=3)": "progress must be a function of done and total, got int",
+    "elite(2, log=3)": "log must be a function of step and metrics, got int",
+    "roll(u, observe=3)": "observe must be a function of model and data, got int",
+    "roll(u, observe=lambda data: data.qpos)": "observe must be a function of model and data, got function: too many",
+    "roll(lambda state: jnp.zeros(1), horizon=2)": "policy must be a function of params and state, got function: too many",
+    "mg.SceneTask(scene, state, lambda: 0.0, 2)": "cost must be a function of trajectory, got Partial: too many",
+    "mg.SceneTask(scene, state, len, 2, start_distribution=3)": "start_distribution must be a function of key, got int",
+    "mg.SceneTask(scene, state, len, 2, observe=3)": "observe must be a function of model and data, got int",
+    "mg.closed_loop(course, None, 0.1)": "policy must be a function of params and state, got NoneType",
+    "mg.closed_loop(course, mg.linear_policy(2, 1), 0.1)": "policy must be a function of params and state, got tuple",
+    "mg.parameter_noise(3, 0.1)": "function must be a function of params, got int",
+    "mg.parameter_noise(0.1, lambda x: x @ x)": "stddev must be real numbers, got function",
+    "mg.parameter_noise(lambda x, y: x @ y, 0.1)": "function must be a function of params, got function: missing",
+    # Keys.
+    "optimise(key=None)": "key must come from jax.random.key",
+    "optimise(key='0')": "key must come from jax.random.key",
+    "optimise(key=jax.random.PRNGKey(0))": "one leading axis, got uint32 of shape (2,)",
+    "mg.estimated_gradient(noisy, 0, estimator=estimators.first_order)": "key must be one of jax.random.key, got 0",
+    "learn(key=None)": "key must be of jax.random.key, got NoneType",
+    "learn(key=jnp.zeros(3))": "key must be of jax.random.key, got float32 of shape (3,)",
+    "mg.learning.evaluate(cart, len, 0, num_episodes=2)": "key must be one of jax.random.key, got 0",
+    "cart.reset(0)": "key must be one of jax.random.key, got 0",
+    "cart.reset(jax.random.split(key, 3))": "got an array of shape (3,); jax.vmap takes several",
+    "measured(key=0)": "key must be one of jax.random.key, got 0",
+    "measured(key=None)": "key must be one of jax.random.key, got None",
+    "first(key=np.random.default_rng(0))": "key must be one of jax.random.key, got Generator",
+    # Counts, seeds and horizons.
+    "mg.SceneTask(scene, state, len, 2.0)": "horizon must be a whole number, got 2.0",
+    "mg.SceneTask(scene, state, len, 0)": "horizon must be at least 1, got 0",
+    "mg.SceneTask(scene, state, len, '2')": "horizon must be a whole number, got '2'",
+    "mg.sweep(balls, horizon=2.5)": "horizon must be a whole number, got 2.5",
+    "mg.sweep(balls, num_samples=0)": "num_samples must be at least 2, got 0",
+    "mg.check(balls, seed='a')": "seed must be a whole number, got 'a'",
+    "mg.load_scene(scene.mj_model, max_contacts=2.5)": "max_contacts must be a whole number, got 2.5",
+    "mg.render.frames(scene, jnp.zeros((2, 1)), width=64.5)": "width must be a whole number, got 64.5",
+    "learn(num_updates='3')": "num_updates must be a whole number, got '3'",
+    "mg.learning.Settings(num_environments=8.0)": "num_environments must be a whole number, got 8.0",
+    "mg.learning.Settings(actor_layers=64)": "actor_layers must be a tuple of hidden sizes, such as (64, 64), got int",
+    # Numbers of another type: text, lists that are ragged, integers, None, objects.
+    "roll([[0.0], [0.0, 1.0]])": "controls must be real numbers, got list",
+    "mg.initial_state(scene, qvel=data)": "qvel must be real numbers, got MjData",
+    "mg.initial_state(scene, state)": "qpos must be real numbers, got State",
+    "mg.initial_state(scene, qpos='0.1')": "qpos must be real numbers, got str",
+    "scene.with_model(body_mass='1')": "body_mass must be real numbers, got str",
+    "mg.load_scene(scene.mj_model, timestep='0.01')": "timestep must be real numbers, got str",
+    "mg.check(balls, budget='1')": "budget must be real numbers, got str",
+    "mg.check(balls, derivatives='no')": "derivatives must be True or False, got str",
+    "mg.sweep(balls, noise='a')": "noise must be real numbers, got str",
+    "mg.sweep(balls, stiffness=['a'])": "stiffness must be real numbers, got list",
+    "mg.sweep(balls, stiffness=-1.0)": "stiffness must be positive and finite, got -1.0",
+    "mg.Onset('wide')": "width must be real numbers, got str",
+    "mg.Smoothing('1e-3')": "length must be real numbers, got str",
+    "mg.Softness('1e3')": "softness must be real numbers, got str",
+    "mg.open_loop(course, '0.1')": "stddev must be real numbers, got str",
+    "mg.closed_loop(course, *mg.linear_policy(2, 1))": "stddev must be real numbers, got Linear",
+    "mg.parameter_noise(lambda x: x @ x, None)": "stddev must be real numbers, got NoneType",
+    "mg.parameter_noise(lambda x: x @ x, [0.1, -0.1])": "stddev must be positive",
+    "mg.learning.Settings(alpha='auto')": "alpha must be real numbers, got str",
+    "mg.learning.Settings(stddev=0.3)": "stddev must be positive at the beginning and at the end, two numbers, got 0.3",
+    "mg.learning.Settings(actor_rate=-1e-3)": "actor_rate must be positive, got -0.001",
+    "mg.learning.Settings(critic_rate=float('nan'))": "critic_rate must be positive, got nan",
+    "cart.step(cart.reset(key), 'left')": "action must be real numbers, got str",
+    "fit.Recording({'qpos': 'abc'})": "qpos of the recording must be real numbers, got str",
+    "fit.Recording({'qpos': [[1, 2], [3]]})": "qpos of the recording must be real numbers, got list",
+    "optimise(at=np.array([1, 2]))": "params must be floating-point, got int32; write 1.0 in place of 1",
+    # NaN, infinity, nothing, and signs.
+    "roll(u, inputs={'qfrc_applied': jnp.full((2, 1), jnp.nan)})": "inputs['qfrc_applied'] must be finite, got nan",
+    "scene.with_model(body_mass=jnp.array([0.0, jnp.inf]))": "body_mass must hold numbers, got infinity",
+    "scene.with_model(geom_friction=jnp.array([[-1.0, 0, 0]]))": "geom_friction must not be negative, got -1",
+    "fit.Recording({})": "measured and times of the recording must have the same number of rows, got set()",
+    "fit.Recording({'qpos': []})": "measured and times of the recording must have the same number of rows, got {0}",
+    "fit.Recording({'qpos': five}, times=[0, 1, 2, 3, np.nan])": "times of the recording must be finite",
+    "fit.Recording({'qpos': five}, np.full((4, 1), np.nan))": "controls of the recording must be finite",
+    "measured(softness=[1e3, 1e4])": "got lengths [()]; give arrays, not lists",
+    # Units: degrees for radians, milliseconds for seconds.
+    "warned(mg.initial_state, hinged, qpos=[45.0])": "h begins at 45 rad, beyond its range from -1.5708 to 1.5708 rad",
+    "warned(mg.load_scene, scene.mj_model, timestep=2)": "a time step of 2 s is long: give seconds",
+    # One thing in the place of another, and wrong orders.
+    "mg.rollout(state, scene, u)": "scene must be of mg.load_scene, got State",
+    "mg.rollout(scene, data, u)": "state must be of mg.initial_state, or the end of a rollout, got MjData",
+    "mg.rollout(scene, state.qpos, u)": "state must be of mg.initial_state, or the end of a rollout, got",
+    "mg.rollout('scene.xml', state, u)": "scene must be of mg.load_scene, got str",
+    "roll(u, 0.1 * u)": "params must belong to a policy, got them beside a sequence of controls: give noise as noise=",
+    "roll(u, checkpoint='run.npz')": "checkpoint must be True or False, got str",
+    "roll(u, contact=mg.Slope)": "contact must be mg.Discrete(), mg.Slope(), mg.Onset() or mg.Smoothing(), got <class",
+    "mg.forward(scene, state)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got Scene",
+    "mg.step(scene.mj_model, data)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got MjModel",
+    "mg.step(scene.data, scene.model)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got Data",
+    "mg.solve(scene.mj_model, data)": "model must be MJX's, as scene.model",
+    "mg.set_const(scene)": "model must be MJX's, as scene.model, got Scene",
+    "mg.sensor(scene, state, 'touch')": "model must be MJX's, as scene.model, got Scene",
+    "mg.load_scene(data)": "source must be an MJCF file",
+    "mg.open_loop(scene, 0.1)": "task must be a task, such as mg.SceneTask, got Scene",
+    "mg.open_loop(0.1, course)": "task must be a task, such as mg.SceneTask, got float",
+    "mg.optimise(params, noisy, key, estimator=first, optimiser=optax.sgd(0.1), num_steps=2)": "objective must be an Objective",
+    "mg.optimise(course, u, key, estimator=zeroth, optimiser=optax.sgd(0.1), num_steps=2)": "an Objective (wrap a function",
+    "optimise(objective=course)": "a function from a scale to an objective), got SceneTask",
+    "optimise(checkpoint=3)": "checkpoint must be the path of a file, got int",
+    "optimise(patience=2.5)": "patience must be a whole number, got 2.5",
+    "learn(checkpoint=3)": "checkpoint must be the path of a file, got int",
+    "learn(environment=scene)": "environment must be one mg.envs.Environment or several, got Scene",
+    "learn(environment=envs.diffrl.CartPole)": "environment must be one mg.envs.Environment or several, got <class",
+    "identify(free_start='yes')": "free_start must be True or False, got str",
+    "identify(held_out=[1])": "recordings must be of mg.identification.Recording, got int",
+    "identify(held_out=fit.Recording({'qpos': five}))": "held_out must be a list of recordings, got Recording",
+    "mg.identify(scene.mj_model, {'a': fit.Parameter(1.0)}, [fit.Recording({'qpos': five})])": "scene must be of mg.load_scene",
+    "mg.identify(scene, [fit.Parameter(1.0)], [fit.Recording({'qpos': five})])": "parameters must be a dict from names to",
+    "fit.Recording(five)": "measured of the recording must be a dict by signal",
+    "fit.Recording({'qpos': five}, noise=0.1)": "noise of the recording must be a dict by signal",
+    "fit.Recording({'qpos': five}, start=data)": "start of the recording must be of mg.initial_state, got MjData",
+    "fit.Recording({'qpos': five}, times=3)": "times of the recording must be finite, one row per time, got 3",
+    "fit.damping(scene, 'joint', bounds=3)": "bounds of damping must be two numbers that increase, got 3",
+    "fit.damping(scene, 'joint', bounds=(1, 0))": "bounds of damping must be two numbers that increase, got (1, 0)",
+    "mg.check(scene, 'height')": "there is no body or site ''",
+    "mg.check(scene, 'length:ball')": "cost must be file.py:function, module:function, or of a body as height:torso",
+    "mg.render.frames(scene, state)": "qpos must be positions, got a state: give its .qpos",
+    "mg.render.frames(scene, data)": "qpos must be positions, got a mjdata: give its .qpos",
+    "mg.render.write_video(np.zeros((2, 4, 4, 3), np.uint8), 'v.mp4')": "path must be the path of a file, got ndarray",
+    "mg.render.write_video('v.mp4', np.zeros((2, 4, 4, 5), np.uint8))": "video must have shape (frames, height, width, 3), got",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",
@@ -312,6 +462,16 @@ FOUND = {
     "jax.vmap(lambda k: first(key=k))(jax.random.split(key, 3))": "no error",
     "jax.jit(lambda a: jax.vmap(estimators.rules.FixedAlpha)(a))(jnp.zeros(2))": "no error",
     "optimise(key=jax.random.split(key, 2))": "no error",
+    "optimise(num_steps=jnp.array(2), patience=np.int64(3))": "no error",
+    "optimise(log=lambda *told: None, evaluate=jnp.sum)": "no error",
+    "optimise(log=lambda step, metrics, end='': None)": "no error",
+    "mg.SceneTask(scene, state, len, np.int64(2))": "no error",
+    "roll([[0.0], [0]])": "no error",
+    "roll(np.zeros((2, 1), int))": "no error",
+    "roll(np.zeros((2, 1), np.float64))": "no error",
+    "jax.jit(jax.jit(lambda x: mg.initial_state(scene, qpos=[x[0]])))(params)": "no error",
+    "mg.Softness(stiffness=10**10)": "no error",
+    "fit.Recording({'qpos': [0, 1, 2]}, [[0], [1]])": "no error",
 }  # fmt: skip
 
 

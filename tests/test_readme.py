@@ -50,6 +50,11 @@ def _balances(names):
     assert np.median(names["balance"].seconds) < 1 / 60
 
 
+def _reaches(names):
+    """The hand is at the second place, 0.6 m from the first."""
+    np.testing.assert_allclose(names["hand"](names["data"].qpos), [-0.3, 0.4], atol=0.02)
+
+
 def _holds_and_learns(names):
     """Knocked to more than 0.05 rad, the pole stands again; the network's cost falls by half and more."""
     tilt = np.abs(names["knocked"].qpos[:, 1])
@@ -95,6 +100,7 @@ _CHECKS = {
     _stands: "learned",
     _pushes_the_ball_to_its_place: "pusher",
     _balances: "balance",
+    _reaches: "arm",
     _holds_and_learns: "",
     _descends_by_pytorch: "",
     _rises: "result",

@@ -81,9 +81,9 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         workspace.check(task.scene)
         stiffness, knob, objective = _wall(task, settings)
     with workspace.stage("gradients", f"values of {knob_name}", len(stiffness)) as advance_to:
-        measured = workspace.once(
-            "gradients",
-            lambda: bias_variance(
+
+        def whole() -> mg.diagnostics.BiasVariance:
+            found = bias_variance(
                 objective,
                 jnp.asarray(settings.angles)[:, None],
                 jax.random.key(settings.seed),
@@ -93,8 +93,12 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 confidence=settings.confidence,
                 compiler_options=compiler_options() if settings.problem == "own" else None,
                 progress=lambda done, _: advance_to(done),
-            ),
-        )
+            )
+            if len(found.cost) < len(stiffness):
+                raise KeyboardInterrupt
+            return found
+
+        measured = workspace.once("gradients", whole)
     if (bad := ~np.isfinite(np.asarray(measured.bias)).all(axis=(1, 2))).any():
         remedy = "take smaller angles, less noise or a smaller slope"
         if knob_name == "stiffness":

@@ -1,5 +1,6 @@
 """What a bias and variance experiment can be told; imports nothing heavy."""
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -52,4 +53,6 @@ class Settings(OwnScene, RunSettings):
     def _has_problem(self) -> "Settings":
         if self.task is None and self.scene is None:
             raise ValueError("task: required where there is no scene, and missing")
+        if self.problem == "ball_wall" and (far := [x for x in self.angles if abs(x) > math.tau]):
+            raise ValueError(f"angles: must be in rad, within a turn, got {far[0]:g}")
         return self

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjxgrad._arrays import instance
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import forces, kinematics, tree
 
@@ -31,6 +32,7 @@ def set_const(model: mjx.Model) -> mjx.Model:
     they depend on, and works under `jax.vmap`. Masses and inertias are inputs here, although MuJoCo's compiler may derive them
     from a geom's size or density: a changed size changes no mass.
     """
+    instance("model", model, mjx.Model, "MJX's, as scene.model")
     return model.replace(**constants_of(model))  # pyright: ignore[reportReturnType]
 
 

@@ -1,28 +1,29 @@
 """One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
 import contextlib
+import functools
 import os
 import textwrap
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import function, instance, real, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
-from mjxgrad.checking.figure import telling
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Measured, Noise, measure
+from mjxgrad.checking.measure import Line, Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.objective.task import as_pytree, checked_cost
-from mjxgrad.report import Block, page
+from mjxgrad.report import INK, Block, page, svg
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -31,6 +32,8 @@ _BATCHES = (64, 32)
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
+_SIZE = (4.6, 2.9)  # of a figure, in inches
+_UNITS = {"where": "m, rad", "how": "m/s, rad/s"}  # by an outcome's first word; others have the user's units
 _MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
@@ -118,7 +121,7 @@ def check(
         source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
         cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it, or its name as in `sweep`;
             motions are then simulated from their start. None uses random mixes of final positions and velocities.
-        derivatives: whether to measure derivatives; False looks at motions alone.
+        derivatives: whether to measure derivatives; False looks at motions alone, and calls a cost once.
         budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
             measurements that are left out.
         seed: seed of all random numbers.
@@ -131,8 +134,11 @@ def check(
         ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
         SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
-    if not budget > 0:
+    instance("derivatives", derivatives, bool, "True or False")
+    if not real("budget", budget) > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
+    function("log", log, "text")
+    function("cost", None if isinstance(cost, str) else cost, "trajectory")
     say = log or (lambda _: None)
     rng = np.random.default_rng(whole("seed", seed, 0))
     with warnings.catch_warnings(record=True) as caught:
@@ -146,17 +152,22 @@ def check(
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = _outcomes(scene, outcome, rng)
+    if cost is not None and (motions.bad_steps < 0).any():
+        found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
     measured = None
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
-        with contextlib.suppress(TimeoutError):
+        with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(
                 scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
             )
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
-    advice = findings.recommend(scene, motions, stability, measured, _max_contacts(scene, motions))
+    # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
+    room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
+    slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
+    advice = findings.recommend(scene, motions, stability, measured, slots)
     path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,
@@ -170,13 +181,6 @@ def check(
         motions=motions,
         measured=measured,
     )
-
-
-def _max_contacts(scene: Scene, motions: Motions) -> int | None:
-    """Return a number of contact slots to set, if motions needed far fewer than all."""
-    # Other motions may have more contacts than these.
-    room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
-    return room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
 
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
@@ -255,3 +259,56 @@ task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={adv
 objective = {objective}
 estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
 """
+
+
+def telling(measured: Measured, outcomes: Sequence[str]) -> Block:
+    """Draw the line on which MuJoCo's derivative is farthest from the slope, or the line with the largest jump."""
+    line, time, outcome = _most_telling(measured)
+    words, of = outcomes[outcome], (slice(None), time, outcome)
+    unit = _UNITS.get(words.partition(" ")[0], "units of the cost")
+    caption = (
+        f"{words[:1].upper() + words[1:]} after {measured.times[time]:.2g} s, along a random change of {line.varied} "
+        f"({line.pose}). The other figure: its derivatives, which should lie on the grey slope."
+    )
+    caption += " Dashed: a jump." * bool(len(line.jumps.places))
+    x, fine, (smooth, plain) = line.plain.parameters, line.fine.outcomes[of], line.plain.derivatives[:, *of]
+    panel = functools.partial(_panel, x, line.jumps.places)
+    moved = {"MuJoCo": (line.plain.outcomes[of], INK, "o")}
+    derived = {"discrete": (plain, "#d55e00", "s"), "slope": (smooth, "#009e73", "o")}
+    drawings = [
+        svg(lambda: panel(f"outcome ({unit})", "shorter time steps", fine, moved), "The outcome along the line"),
+        svg(lambda: panel(f"derivative ({unit})", "its slope", np.gradient(fine, x), derived), "Its derivatives"),
+    ]
+    return Block(drawings=drawings, caption=caption)
+
+
+def _most_telling(measured: Measured) -> tuple[Line, int, int]:
+    jumping = [line for line in measured.lines if len(line.jumps.places)]
+    if jumping:
+        line = max(jumping, key=lambda one: float(one.jumps.sizes.max()))
+        sizes = np.abs(line.jumps.after - line.jumps.before)[line.jumps.largest]
+        return line, len(measured.times) - 1, int(sizes.argmax())
+    compared = [line.plain for line in measured.lines]
+    errors = [np.where(one.is_resolved(), one.relative_error[1], 0) for one in compared]
+    number, time, outcome = np.unravel_index(int(np.argmax(errors)), np.shape(errors))
+    return measured.lines[int(number)], int(time), int(outcome)
+
+
+def _panel(x: np.ndarray, jumps: np.ndarray, what: str, fine: str, curve: np.ndarray, dots: dict[str, tuple]) -> Any:
+    """Draw dots by name, colour and marker over a grey curve; of several kinds, those beyond its range lie on the edge."""
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=_SIZE)
+    axis.plot(x, curve, color="#8b94a1", lw=1.4, label=fine)
+    axis.margins(y=1 / 3)
+    low, high = -np.inf, np.inf
+    if len(dots) > 1:  # beside other derivatives the slope sets the range
+        low, high = axis.get_ylim()
+        axis.set_autoscaley_on(False)
+    for name, (values, colour, marker) in dots.items():
+        axis.plot(x, np.clip(values, low, high), marker, color=colour, ms=3, mew=0, label=name, clip_on=False)
+    for place in jumps:
+        axis.axvline(place, color="#8b94a1", lw=1, ls="--")
+    axis.set(xlabel="place on the line, −1 to 1", ylabel=what)
+    figure.legend(loc="outside upper right", ncols=3)
+    return figure

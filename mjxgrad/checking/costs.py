@@ -1,9 +1,10 @@
 """Costs by name: functions of files and modules, and height, speed, uprightness and reach of bodies."""
 
+import contextlib
 import importlib
 import runpy
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,16 +51,23 @@ def _function(name: str) -> Callable[..., Any]:
     source, _, function = name.rpartition(":")
     if source.endswith(".py") and not Path(source).is_file():
         raise ValueError(f"cost: there is no file {source}")
-    try:
+    with _told(name):
         sys.path.insert(0, str(Path.cwd()))
         names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
-    except Exception as error:  # a user's file may raise anything
-        forms = "file.py:function, module:function, or of a body as height:torso"
-        raise ValueError(f"cost must be {forms}, got {name!r}: {error}") from error
     if not callable(names.get(function)):
         there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
         raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
-    return names[function]
+    return _told(name)(names[function])
+
+
+@contextlib.contextmanager
+def _told(name: str) -> Iterator[None]:
+    """Put an error in a user's file, which may be any, into a sentence."""
+    try:
+        yield
+    except Exception as error:
+        forms = "file.py:function, module:function, or of a body as height:torso"
+        raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}; a cost must be {forms}") from error
 
 
 def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
@@ -67,7 +75,7 @@ def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
     counts = {"body": (model.nbody, model.body), "site": (model.nsite, model.site)}
     known = {kind: [at(i).name for i in range(count)] for kind, (count, at) in counts.items()}
     for kind, names in known.items():
-        if name in names:
+        if name and name in names:
             return names.index(name), kind == "body"
     there = "; ".join(f"{kind}: {', '.join(filter(None, names)) or 'none'}" for kind, names in known.items())
     raise ValueError(f"there is no body or site {name!r} in the scene, but {there}")

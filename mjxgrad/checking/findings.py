@@ -5,18 +5,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import jax
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured
-from mjxgrad.checking.motions import REFINED, Motions
+from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts.state import LARGEST_GROWTH
 from mjxgrad.scene import Scene
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
-    "not_measured", "left_out", "slope", "order", "note",
+    "cost", "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
@@ -105,6 +106,22 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         yield Finding("note", text)
     else:
         yield Finding("note", f"In contact from the start, and nothing else touches: {name_pairs(motions.touching)}.")
+
+
+def cost_finding(motions: Motions, mover: Mover) -> Finding:
+    """Call the cost once with its derivative, along a random motion that stays finite; useless ones are a fault."""
+    rng, motion = np.random.default_rng(0), int(np.argmax(motions.bad_steps < 0))
+    controls = motions.controls[motion, None, :100]  # a cost of long motions may take long
+    start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motions.state(motion, 0))
+    change = Direction(*[rng.normal(size=x.shape[1:]) for x in (start.qvel, start.qvel, controls)])
+    found = mover.move("slope", start, controls, change, [controls.shape[1]])
+    value, derivative = found.outcomes.item(), found.derivatives.item()
+    is_useless = derivative == 0 or not math.isfinite(value + derivative)
+    when = f"after {controls.shape[1] * motions.timestep:.2g} s of a random motion"
+    remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero." * is_useless
+    return Finding(
+        "cost", f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}", is_useless
+    )
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:
@@ -282,6 +299,7 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
     words = {
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
+        "cost": "the cost has no derivative",
         "no_contact": "nothing touches",
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",

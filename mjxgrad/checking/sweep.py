@@ -13,7 +13,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PyTree
 
-from mjxgrad._arrays import is_known, whole
+from mjxgrad._arrays import function, is_known, real, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
@@ -205,21 +205,24 @@ def sweep(
         num_samples: rollouts per estimate.
         num_reference: rollouts for the truth.
         seed: seed of all random numbers.
-        log: called with the name of each part as it starts.
+        log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
         **task_settings: start, horizon and contact of `scene_task`.
 
     Raises:
         ValueError: as `scene_task` and `bias_variance`, or if a stiffness or the noise is not positive.
     """
-    if not all(0 < k < np.inf for k in stiffness):
-        raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, stiffness))}")
-    if not 0 < noise < np.inf:
+    given = np.atleast_1d(np.asarray(real("stiffness", stiffness), float))
+    if not ((given > 0) & (given < np.inf)).all():
+        raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, given))}")
+    if not 0 < real("noise", noise) < np.inf:
         raise ValueError(f"noise must be positive and finite, got {noise}")
     whole("seed", seed, 0)
-    scene = load_scene(source)
+    whole("num_samples", num_samples, 2)
+    function("log", log, "text")
+    scene = source if isinstance(source, Scene) else load_scene(source)
     task = scene_task(scene, cost, seed=seed, **task_settings)
     knob = Knob(task, noise, seed)
-    swept = sorted({*stiffness, knob.own}) if scene.pairs else [1.0]
+    swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     result = bias_variance(
         knob,
         jnp.zeros((1, 1)),
@@ -234,7 +237,10 @@ def sweep(
     question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
     question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
-    ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
-    ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
-    question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
+    if left_out := len(swept) - len(result.cost):
+        question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."
+    if row < len(result.cost):
+        ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
+        ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
+        question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
     return Sweep(scene.name, question, knob.own, result)

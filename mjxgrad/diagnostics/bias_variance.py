@@ -11,6 +11,7 @@ so one sweep of $f$ serves every $\theta$. The line is cut into equal cells and 
 error falls as 1/cells at a jump and faster elsewhere. Quadrature on regular points could not know its error at jumps.
 """
 
+import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import function, one_key, whole
 from mjxgrad._programs import compile_once
 from mjxgrad._text import Printed, aligned, format_number
 from mjxgrad.contact import Softness
@@ -272,8 +273,8 @@ def bias_variance(
     r"""Measure bias and variance of first, zeroth and α-order gradient estimates at every softness and point.
 
     All softnesses share the same noise, which makes differences between them visible. One program is compiled, at the first
-    softness. The loop over softnesses runs on the host, where it can report progress. Samples are kept for the bootstrap:
-    memory grows with points × `num_samples` × dim.
+    softness. The loop over softnesses runs on the host, where it can report progress. Ctrl-C ends it with the softnesses
+    measured so far. Samples are kept for the bootstrap: memory grows with points × `num_samples` × dim.
 
     Args:
         objective_of_softness: function from one softness to the objective; traceable.
@@ -299,7 +300,14 @@ def bias_variance(
         )
     params = jnp.asarray(params)
     whole("num_reference", num_reference, 4)
-    stacked, count = _stacked(softness)
+    function("progress", progress, "done", "total")
+    one_key(key)
+    stacked = jax.tree.map(jnp.asarray, softness)
+    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(stacked)}
+    if len(lengths) != 1 or () in lengths or (0,) in lengths:
+        told = f"got lengths {sorted(lengths)}; give arrays, not lists"
+        raise ValueError(f"softness must have the same leading axis in every leaf, {told}")
+    ((count,),) = lengths
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], stacked) for i in range(count)]
     objective, told = _warned(objective_of_softness, each)
     # Derivatives by the noise where it is known: α-order needs them, and those by the parameters follow.
@@ -324,11 +332,15 @@ def bias_variance(
         return measured, _variance_intervals(samples, batches, confidence)
 
     rows = []
-    with ThreadPoolExecutor(_WORKERS) as pool:
+    # The interruption closes the map, which then begins no other row.
+    with ThreadPoolExecutor(_WORKERS) as pool, contextlib.suppress(KeyboardInterrupt):
         for done in pool.map(row, each):
             rows.append(done)
             if progress is not None:
                 progress(len(rows), count)
+    if not rows:
+        raise KeyboardInterrupt
+    stacked = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
     ends = np.stack([row[1] for row in rows], axis=2)
     return BiasVariance(
@@ -336,7 +348,7 @@ def bias_variance(
         softness=stacked,
         params=params,
         variance_intervals=dict(zip(ESTIMATES, ends, strict=False)),
-        warnings=told,
+        warnings=told[: len(rows)],
         confidence=confidence,
     )
 
@@ -471,12 +483,3 @@ def _variance_intervals(
         terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
         intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)
-
-
-def _stacked(softness: PyTree) -> tuple[PyTree, int]:
-    """Return a pytree of arrays with one leading axis, and its length."""
-    softness = jax.tree.map(jnp.asarray, softness)
-    lengths = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(softness)}
-    if len(lengths) != 1 or () in lengths or (0,) in lengths:
-        raise ValueError(f"softness must have the same leading axis in every leaf, got lengths {sorted(lengths)}")
-    return softness, lengths.pop()[0]

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import one_key, real, whole
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -144,6 +144,7 @@ class Environment(InScene):
 
     def reset(self, key: PRNGKeyArray) -> EnvState:
         """Begin an episode; the key is consumed, and decides all draws until the next reset."""
+        one_key(key)
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
         obs = self.observe(physics, memory)
@@ -160,6 +161,7 @@ class Environment(InScene):
         Raises:
             ValueError: if the action does not have one number per actuator.
         """
+        action = real("action", action)
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")

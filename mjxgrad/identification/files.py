@@ -74,13 +74,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
 def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
     """Return a motion recorded as CSV with a line of names, or as NPZ, and the names of columns that the scene does not have.
 
-    Columns are `time` (s), and positions `qpos:joint`, velocities `qvel:joint`, controls `ctrl:actuator`, activations
-    `act:actuator`, readings `sensor:name`. The kind may be left out for a unique name: a joint is then its position, an
-    actuator its control. An element with several numbers takes an index, `qpos:root[0]`, or `qpos[7]` in the whole array. An
-    NPZ has the same names. Each array has one row per time, with one number or all of the element's numbers. Empty cells and
-    NaN were not measured.
-
-    Each signal is weighed by its variation. The motion begins at its first row; missing parts are the scene's pose, at rest.
+    Columns are as `mjxgrad identify --help` tells. An array of an NPZ has one row per time, with one number or all of the
+    element's numbers. Each signal is weighed by its variation. The motion begins at its first row; missing parts are the
+    scene's pose, at rest.
 
     Raises:
         ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator.
@@ -134,6 +130,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is no archive of arrays")
     with np.load(path) as arrays:
         wholes = {name: np.asarray(arrays[name], float) for name in arrays}
     wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
@@ -143,6 +141,8 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 def _read_csv(path: Path) -> dict[str, np.ndarray]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         names, *rows = [row for row in csv.reader(file) if row] or [[]]
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise ValueError(f"{', '.join(twice)} stands there more than once")
     for line, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")

@@ -263,6 +263,8 @@ def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: 
         if not (nominal > 0).all():
             raise ValueError(f"bounds of {name} must be given where it is not positive, got {nominal.tolist()}")
         bounds = (nominal / _FACTOR, nominal * _FACTOR)
+    if np.shape(bounds)[:1] != (2,) or not np.all(np.asarray(bounds[0]) < np.asarray(bounds[1])):
+        raise ValueError(f"bounds of {name} must be two numbers that increase, got {bounds}")
     if name != "gear" and np.any(np.asarray(bounds[0]) < 0):
         raise ValueError(f"bounds of {name} must not be negative, got {bounds[0]}")
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)

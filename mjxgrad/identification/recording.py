@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mjxgrad._arrays import instance, real
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.rollouts import State, initial_state, rollout
@@ -45,10 +46,19 @@ class Recording:
     name: str = "the recording"
 
     def __post_init__(self):
-        rows = {name: np.asarray(value, float) for name, value in self.measured.items()}
+        for name in ("measured", "noise"):
+            instance(f"{name} of {self.name}", getattr(self, name), Mapping, 'a dict by signal, such as {"qpos": ...}')
+        rows = {name: np.asarray(real(f"{name} of {self.name}", value), float) for name, value in self.measured.items()}
+        for name in ("controls", "times", "control_times"):
+            if (value := getattr(self, name)) is None:
+                continue
+            if not (np.ndim(value) and np.isfinite(real(f"{name} of {self.name}", value)).all()):
+                raise ValueError(f"{name} of {self.name} must be finite, one row per time, got {value}")
+            if name != "controls" and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
+                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
-        if len(lengths) != 1:
+        if len(lengths) != 1 or 0 in lengths:
             raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {lengths}")
         count = len(self.controls) if self.controls is not None else None
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
@@ -56,14 +66,11 @@ class Recording:
             raise ValueError(
                 f"measured of {self.name} must have {needed}, or times, got {max(lengths)}: NaN fills gaps"
             )
-        for name in ("times", "control_times"):
-            value = getattr(self, name)
-            if value is not None and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
-                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
+        instance(f"start of {self.name}", self.start, State | None, "of mg.initial_state")
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
         for name, value in self.noise.items():
-            if not (np.asarray(value) > 0).all():
+            if not (np.asarray(real(f"noise of {name}", value)) > 0).all():
                 raise ValueError(f"noise of {name} of {self.name} must be positive, or inf for no weight, got {value}")
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:

@@ -42,6 +42,7 @@ class Stopped(enum.Enum):
     CONVERGED = "converged"
     STALLED = "stalled"
     STEPS = "max_steps reached"
+    INTERRUPTED = "interrupted"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Identification(Printed):
         """The answer, in at most 15 words."""
         lost = int(np.isinf(np.concatenate([np.ravel(half) for half in self.half_width.values()])).sum())
         if self.stopped is not Stopped.CONVERGED:
-            ended = "stalled" if self.stopped is Stopped.STALLED else "was cut short"
+            ended = {Stopped.STALLED: "stalled", Stopped.STEPS: "was cut short"}.get(self.stopped, "was interrupted")
             return f"The search {ended}: do not trust the values."
         count = len(self.names)
         found = f"{count - lost} of {count} numbers found" if lost else f"All {count} found" if count > 1 else "Found"
@@ -175,13 +176,15 @@ class Identification(Printed):
 
     def save(self, path: str | Path) -> None:
         """Write values and bounds to a file as YAML, in the format of `ParameterDict` in `mujoco.sysid`."""
+        # YAML 1.1 reads numbers with a point and without an exponent.
+        yaml = lambda x: np.format_float_positional(x, trim="0").replace("inf", ".inf")  # noqa: E731
         bounds = self.coordinates.lower, self.coordinates.upper
         lower, upper = (self.coordinates.unravel(np.asarray(x)) for x in bounds)
         lines = []
         for name, value in self.values.items():
             parts = {"nominal": self.start[name], "min_value": lower[name], "max_value": upper[name], "value": value}
             lines += [f"{name}:", f"  name: {name}", "  frozen: false"]
-            lines += [f"  {key}: [{', '.join(map(_yaml, np.ravel(x).tolist()))}]" for key, x in parts.items()]
+            lines += [f"  {key}: [{', '.join(map(yaml, np.ravel(x).tolist()))}]" for key, x in parts.items()]
         write(path, "\n".join(lines) + "\n")
 
 
@@ -251,11 +254,6 @@ def _digits(value: float, half_width: float) -> str:
         return format_number(value)
     digits = int(np.clip(np.ceil(np.log10(abs(value) / half_width)) + 2, 2, 9))
     return f"{value:.{digits}g}"
-
-
-def _yaml(number: float) -> str:
-    """Return a number as YAML 1.1 reads it: with a point, and without an exponent."""
-    return np.format_float_positional(number, trim="0").replace("inf", ".inf")
 
 
 def on_host(tree):

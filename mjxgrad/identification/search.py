@@ -6,6 +6,7 @@ this program for residuals and derivative at one point. From their linear model 
 chooses the next.
 """
 
+import contextlib
 import functools
 import importlib
 import math
@@ -19,7 +20,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import instance, whole
+from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import Recording, Windows, residuals, stack
@@ -59,8 +60,8 @@ def identify(
 
     Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
     derivatives through the simulation. Where it leaves more than the stated noise, as where contacts chatter, a second
-    descent begins where differential evolution ends between the bounds; not with `free_start`. Needs optimistix
-    (`pip install 'mjxgrad[identify]'`).
+    descent begins where differential evolution ends between the bounds; not with `free_start`. Ctrl-C ends the search with
+    the best values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
 
     Args:
         scene: the scene with nominal values.
@@ -90,11 +91,15 @@ def identify(
     instance("parameters", parameters, Mapping, "a dict from names to parameters")
     for part in parameters.values():
         instance("parameters", part, Parameter, "of mg.identification, such as mass(scene, 'torso')")
-    for part in recordings:
+    instance("scene", scene, Scene, "of mg.load_scene")
+    instance("held_out", held_out, Sequence, "a list of recordings")
+    for part in (*recordings, *held_out):
         instance("recordings", part, Recording, "of mg.identification.Recording")
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     max_steps = whole("max_steps", max_steps)
+    function("log", log, "step", "metrics")
+    instance("free_start", free_start, bool, "True or False")
     try:  # before anything is compiled
         importlib.import_module("optimistix")
     except ImportError as error:
@@ -103,8 +108,12 @@ def identify(
     start = program.start()
     end = _descend(program, start, max_steps, log)
     has_noise = all(set(one.noise) == set(one.measured) for one in recordings)
-    if has_noise and not free_start and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
-        again = _descend(program, program.searched(), max_steps, log)
+    is_left = has_noise and not free_start and end.stopped is not Stopped.INTERRUPTED
+    if is_left and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
+        again = end._replace(stopped=Stopped.INTERRUPTED)
+        with contextlib.suppress(KeyboardInterrupt):
+            again = _descend(program, program.searched(), max_steps, log)
+        end = end._replace(stopped=again.stopped if again.stopped is Stopped.INTERRUPTED else end.stopped)
         if _rms(program, again.found) < _rms(program, end.found):
             end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
     return _identified(program, end, held_out, has_noise)
@@ -116,7 +125,7 @@ class _End(NamedTuple):
     point: Array
     found: tuple[Array, ...]  # residuals and their derivatives there
     num_steps: int
-    has_ended: bool  # before the largest number of steps
+    stopped: Stopped
     first: float  # root mean square of the residuals at the start
     removable: float  # share of the sum of squares that the linear model would still remove
 
@@ -127,6 +136,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
     values = np.asarray(coordinates.values(end.point[: len(coordinates.names)]), float)
     explained = on_host(end.found)
     residual, slope, num_offsets = _without_offsets(*explained)
+    signals = explained[0].reshape(*program.windows.index.shape, -1)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     after, before = np.linalg.norm(residual), end.first * np.sqrt(numbers)
@@ -142,13 +152,13 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
         rms=(end.first, float(after / np.sqrt(numbers))),
         has_noise=has_noise,
-        held_out_rms=program.held_out_rms(held_out, nominal, values),
+        held_out_rms=None if end.stopped is Stopped.INTERRUPTED else program.held_out_rms(held_out, nominal, values),
         offsets=np.asarray(program.offsets(end.point)) if program.free_start else None,
-        correlation=_correlation(program.windows, explained[0]),
+        correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
         removable=end.removable,
         num_numbers=numbers,
         num_steps=end.num_steps,
-        stopped=(Stopped.STALLED if stalls else Stopped.CONVERGED) if end.has_ended else Stopped.STEPS,
+        stopped=Stopped.STALLED if stalls and end.stopped is Stopped.CONVERGED else end.stopped,
         scene=program.put(program.nominal, jnp.asarray(values, coordinates.nominal.dtype)),
         coordinates=coordinates,
         units={name: parameter.unit for name, parameter in program.parameters.items()},
@@ -271,7 +281,7 @@ def _num_numbers(windows: Windows) -> int:
 
 
 def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -> _End:
-    """Minimise the residuals from a point by Levenberg-Marquardt."""
+    """Minimise the residuals from a point by Levenberg-Marquardt, until an interruption at most."""
     lower, upper = program.box()
     found = best = program(point)
     first = _rms(program, found)
@@ -282,25 +292,29 @@ def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -
     solver, state = _levenberg_marquardt(*linear[2].shape, point.dtype)
     state = eqx.tree_at(lambda s: s.y_eval, state, point)
     refusals, slow, removable, total = 0, 0, 1.0, math.inf
-    for count in range(1, max_steps + 1):
-        point, state, _ = _step(solver, point, state, linear)
-        is_accepted = int(state.num_steps_since_acceptance) == 0
-        if is_accepted:
-            fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
-            slow = slow + 1 if fell * program.num_numbers < _TOO_LITTLE * total else 0
-            best, refusals, removable = found, 0, float(_removable(linear))
-        else:
-            refusals += 1
-        if log is not None:
-            rms = float(jnp.linalg.norm(linear[1])) / _FIRST_SIZE * first
-            log(count, {"rms": rms, "is_accepted": float(is_accepted)})
-        is_near = removable * program.num_numbers < _NEAR_ENOUGH**2
-        if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS or slow == _SLOW_STEPS:
-            return _End(point, best, count, True, first, removable)
-        state = eqx.tree_at(lambda s: s.y_eval, state, jnp.clip(state.y_eval, lower, upper))
-        found = program(state.y_eval)
-        linear = _linear_model(program, found, state.y_eval, size)
-    return _End(point, best, max_steps, False, first, removable)
+    end = _End(point, best, 0, Stopped.INTERRUPTED, first, removable)
+    with contextlib.suppress(KeyboardInterrupt):
+        for count in range(1, max_steps + 1):
+            point, state, _ = _step(solver, point, state, linear)
+            is_accepted = int(state.num_steps_since_acceptance) == 0
+            if is_accepted:
+                fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
+                slow = slow + 1 if fell * program.num_numbers < _TOO_LITTLE * total else 0
+                best, refusals, removable = found, 0, float(_removable(linear))
+            else:
+                refusals += 1
+            end = _End(point, best, count, Stopped.INTERRUPTED, first, removable)
+            if log is not None:
+                rms = float(jnp.linalg.norm(linear[1])) / _FIRST_SIZE * first
+                log(count, {"rms": rms, "is_accepted": float(is_accepted)})
+            is_near = removable * program.num_numbers < _NEAR_ENOUGH**2
+            if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS or slow == _SLOW_STEPS:
+                return end._replace(stopped=Stopped.CONVERGED)
+            state = eqx.tree_at(lambda s: s.y_eval, state, jnp.clip(state.y_eval, lower, upper))
+            found = program(state.y_eval)
+            linear = _linear_model(program, found, state.y_eval, size)
+        return end._replace(stopped=Stopped.STEPS)
+    return end
 
 
 @functools.lru_cache(maxsize=32)
@@ -356,13 +370,6 @@ def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, siz
     if program.free_start:
         slope = jnp.concatenate([slope, jax.scipy.linalg.block_diag(*found[2]) / size], axis=1)
     return point, residual, slope
-
-
-def _correlation(windows: Windows, residual: np.ndarray) -> float:
-    """Return the correlation of residuals with those of the same signal one time before, from -1 to 1."""
-    signals = residual.reshape(*windows.index.shape, -1)
-    squares = float((signals**2).sum())
-    return float((signals[:, 1:] * signals[:, :-1]).sum()) / squares if squares else 0.0
 
 
 def _without_offsets(

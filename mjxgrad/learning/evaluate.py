@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import one_key, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.stepping import Discrete, Engine
@@ -53,6 +53,7 @@ def evaluate(
         ValueError: if there are no episodes, or no such engine.
     """
     num_episodes = whole("num_episodes", num_episodes)
+    one_key(key)
     judge = environment if engine == "mjx" else environment.with_contact(Discrete(engine))
 
     def one(key: PRNGKeyArray) -> Evaluation:

@@ -103,6 +103,8 @@ def learn(
     instance("key", key, jax.Array, "of jax.random.key")
     num_updates, log_every = whole("num_updates", num_updates), whole("log_every", log_every)
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        if key.dtype != jnp.uint32 or key.shape[-1:] != (2,):
+            raise ValueError(f"key must be of jax.random.key, got {key.dtype} of shape {key.shape}")
         key = jax.random.wrap_key_data(key)
     environments = [environment] if not isinstance(environment, Sequence) else list(environment)
     if not environments or not all(isinstance(one, Environment) for one in environments):
@@ -118,7 +120,7 @@ def learn(
         segment=log_every,
         over=over,
         log=log,
-        checkpoint=None if checkpoint is None else Path(checkpoint),
+        checkpoint=checkpoint,
         on_all_devices=True,
     )
     seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (len(progress.seconds), *shape))

@@ -1,8 +1,9 @@
 """Settings for learning from short windows."""
 
 import dataclasses
+from collections.abc import Sequence
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import instance, real, whole
 from mjxgrad.batched.device import is_gpu
 
 
@@ -19,9 +20,9 @@ class Settings:
         alpha: weight of first order, from 0 to 1: 1 is SHAC, 0 has no derivatives. None takes that of the least error in each
             update, see `mixing`: α-order.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
-        actor_layers: hidden sizes of the policy.
+        actor_layers: hidden sizes of the policy: 128, 64, 32, or twice as many on a GPU, where hoppers then fall less.
         actor_scale: factor of the initial gains of the policy's hidden layers.
-        critic_layers: hidden sizes of the value function.
+        critic_layers: hidden sizes of the value function: 64, 64, or twice as many on a GPU.
         actor_rate: learning rate of the policy, which decreases linearly to zero.
         actor_decay: factor of the policy's rate per update, in place of the linear decrease; None for the latter.
         critic_rate: learning rate of the value function, which decreases linearly to zero.
@@ -40,9 +41,11 @@ class Settings:
     trace: float = 0.9
     alpha: float | None = None
     stddev: tuple[float, float] = (0.4, 0.25)
-    actor_layers: tuple[int, ...] = (128, 64, 32)
+    actor_layers: tuple[int, ...] = dataclasses.field(
+        default_factory=lambda: (256, 128, 64) if is_gpu() else (128, 64, 32)
+    )
     actor_scale: float = 1.0
-    critic_layers: tuple[int, ...] = (64, 64)
+    critic_layers: tuple[int, ...] = dataclasses.field(default_factory=lambda: (128, 128) if is_gpu() else (64, 64))
     actor_rate: float = 1e-3
     actor_decay: float | None = None
     critic_rate: float = 5e-4
@@ -54,17 +57,20 @@ class Settings:
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             whole(name, getattr(self, name))
+        for name in ("actor_scale", "actor_rate", "critic_rate", "largest_sample"):
+            if not real(name, getattr(self, name)) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        for name in ("actor_layers", "critic_layers"):
+            instance(name, getattr(self, name), Sequence, "a tuple of hidden sizes, such as (64, 64)")
+        if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
+            raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
         for name in ("discount", "trace", *(["alpha"] if self.alpha is not None else [])):
-            if not 0 <= getattr(self, name) <= 1:
+            if not 0 <= real(name, getattr(self, name)) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
         if self.trace < 1 and not self.has_critic:
             raise ValueError(
                 f"trace must be 1 without a value function, got {self.trace}: there is nothing to blend with"
             )
-        if not self.largest_sample > 0:
-            raise ValueError(f"largest_sample must be positive, got {self.largest_sample}")
-        if min(self.stddev) <= 0:
-            raise ValueError(f"stddev must be positive at the beginning and at the end, got {self.stddev}")
         if (self.num_environments * self.window) % self.critic_batches:
             raise ValueError(
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "

@@ -1,6 +1,7 @@
 """Descents: methods that improve a vector of parameters, with a history, the best parameters and reasons to stop."""
 
 import dataclasses
+import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import function, whole
 from mjxgrad._programs import compile_once, is_traced
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
@@ -44,16 +45,15 @@ class RunOptions(eqx.Module):
             result of an uninterrupted one to the bit, except for the seconds.
     """
 
-    num_steps: int
+    num_steps: int = eqx.field(converter=functools.partial(whole, "num_steps"))
     evaluate: Callable[[Vector], Scalar] | None = None
-    evaluate_every: int = 10
-    patience: int = 10
+    evaluate_every: int = eqx.field(default=10, converter=functools.partial(whole, "evaluate_every"))
+    patience: int = eqx.field(default=10, converter=functools.partial(whole, "patience"))
     log: Log | None = None
-    checkpoint: Path | None = eqx.field(default=None, converter=lambda path: None if path is None else Path(path))
+    checkpoint: str | Path | None = None
 
     def __check_init__(self):
-        for name in ("num_steps", "evaluate_every", "patience"):
-            whole(name, getattr(self, name))
+        function("evaluate", self.evaluate, "params")
 
 
 class Carry(eqx.Module):
@@ -84,7 +84,8 @@ class Descent(Method):
                 "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles its own program, "
                 "and takes one key per seed"
             )
-        key, params = jnp.asarray(key), jnp.asarray(params)
+        given: Any = key if eqx.is_array(key) else np.asarray(key)  # of anything
+        key, params = given, jnp.asarray(params)
         if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.ndim > 1:
             raise ValueError(
                 f"key must come from jax.random.key, with at most one leading axis, got {key.dtype} of shape {key.shape}; "

@@ -11,6 +11,7 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import function, instance, one_key
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
@@ -88,25 +89,18 @@ class GradientStep(Descent):
     annealing: Annealing | None
 
     def __check_init__(self):
+        function("annealing", self.annealing, "step")
         if self.annealing is None:
             as_objective(self.objective)
-        elif not callable(self.annealing):
-            raise ValueError(
-                f"annealing must be a schedule from step to scale, got {self.annealing!r}; "
-                "for a fixed scale give the objective that scale"
-            )
         elif isinstance(self.objective, Objective):
             raise ValueError(
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
-        if not callable(self.estimator):
-            named = "functools.partial(mg.estimators.alpha_order, num_samples=64)"
-            raise ValueError(f"estimator must be a function such as {named}, got {self.estimator!r}")
-        if not isinstance(self.optimiser, optax.GradientTransformation):
-            raise ValueError(
-                f"optimiser must be of optax, with its settings, such as optax.adam(1e-2), got {self.optimiser!r}"
-            )
+        function("estimator", self.estimator, "objective", "params", "key")
+        instance(
+            "optimiser", self.optimiser, optax.GradientTransformation, "of optax with its settings, as optax.adam(1e-2)"
+        )
 
     def init_state(self, params: Vector) -> PyTree:
         return jax.tree.map(jnp.asarray, self.optimiser.init(params))
@@ -189,6 +183,7 @@ def estimated_gradient(
     Raises:
         ValueError: if `objective` and `annealing` do not belong together.
     """
+    one_key(key)
     rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
     def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Scalar, GradientEstimate]:

@@ -22,6 +22,7 @@ import numpy as np
 from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
+from mjxgrad._arrays import function, instance
 from mjxgrad._programs import compile_once
 from mjxgrad._text import write
 from mjxgrad.batched.device import all_devices
@@ -111,7 +112,7 @@ def run(
     segment: int,
     over: Sequence[list[int | None] | None] = (),
     log: Log | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | Path | None = None,
     on_all_devices: bool = False,
 ) -> Any:
     """Repeat a method until it is over, and return its `result`.
@@ -130,6 +131,9 @@ def run(
     Raises:
         ValueError: if the checkpoint has no folder, is damaged, or from a run with another program, arrays or start.
     """
+    function("log", log, "step", "metrics")
+    instance("checkpoint", checkpoint, str | Path | None, "the path of a file")
+    checkpoint = None if checkpoint is None else Path(checkpoint)
     if checkpoint is not None and not checkpoint.parent.is_dir():
         raise ValueError(
             f"checkpoint must be in a folder that exists, got {checkpoint}; make {checkpoint.parent} first"

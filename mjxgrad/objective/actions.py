@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import instance, whole
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -224,6 +224,7 @@ def closed_loop(task: Task, policy: Policy, stddev: Stddev, *, params: PyTree = 
         Williams. Simple statistical gradient-following algorithms for connectionist
         reinforcement learning. Machine Learning 8, 1992, theorem 1.
     """
+    instance("policy", policy, Callable, "a function of params and state")
     stddev = _action_stddev(task, stddev)
     flat, unravel = (None, unchanged) if params is None else _flat(params)
     dim = None if flat is None else flat.size
@@ -256,6 +257,7 @@ class _ActionsTranspose:
 
 
 def _action_stddev(task: Task, stddev: Stddev) -> Float[Array, "..."]:
+    instance("task", task, Task, "a task, such as mg.SceneTask")
     shape = (task.horizon, task.num_controls)
     if task.horizon * task.num_controls == 0:
         raise ValueError(

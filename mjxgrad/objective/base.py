@@ -17,6 +17,8 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import function as check_function
+from mjxgrad._arrays import instance, real
 from mjxgrad.objective.task import as_pytree
 
 Scalar = Float[Array, ""]
@@ -163,11 +165,8 @@ def unchanged(vector: Vector) -> Vector:
 
 def as_objective(objective: Any) -> Objective:
     """Return an objective unchanged; raise a ValueError for anything else."""
-    if not isinstance(objective, Objective):
-        raise ValueError(
-            f"objective must be an Objective, got {type(objective).__name__}; wrap a function by mg.parameter_noise, "
-            "or give optimise annealing= with a function from a scale to an objective"
-        )
+    remedy = "wrap a function by mg.parameter_noise, or give optimise annealing= with a function from a scale to an objective"
+    instance("objective", objective, Objective, f"an Objective ({remedy})")
     return objective
 
 
@@ -209,6 +208,7 @@ def gaussian(key: PRNGKeyArray, stddev: Float[Array, "..."], shape: tuple[int, .
 
 def positive(stddev: Stddev) -> Float[Array, "..."]:
     """Return the standard deviation as an array; raise a ValueError if it is known and not positive."""
+    stddev = real("stddev", stddev)
     stddev = jnp.asarray(stddev, jnp.result_type(stddev, float))
     # A traced value (a noise schedule, a sweep) cannot be checked here.
     if not isinstance(stddev, jax.core.Tracer) and not bool((stddev > 0).all()):
@@ -255,6 +255,7 @@ def parameter_noise(
     Raises:
         ValueError: if `stddev` is not positive, or neither one number nor `dim` of them.
     """
+    check_function("function", function, "params")
     width = positive(stddev)
     if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")

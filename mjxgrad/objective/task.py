@@ -1,6 +1,7 @@
 """Tasks: horizon, number of controls, start and cost of a controlled system, the input of an objective."""
 
 import dataclasses
+import functools
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import form
+from mjxgrad._arrays import form, function, whole
 from mjxgrad.contact import Softness
 from mjxgrad.rollouts import Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.scene import Scene
@@ -64,10 +65,8 @@ class Task(eqx.Module):
 
 
 def as_pytree(function: Any) -> Any:
-    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap; None stays None."""
-    if function is not None and not callable(function):
-        raise ValueError(f"a cost or policy must be a function, got {function!r:.80}")
-    is_one = function is None or isinstance(function, eqx.Module | jax.tree_util.Partial)
+    """Return a function as a pytree, so that a module that holds it can pass through jit and vmap; others unchanged."""
+    is_one = not callable(function) or isinstance(function, eqx.Module | jax.tree_util.Partial)
     return function if is_one else jax.tree_util.Partial(function)
 
 
@@ -111,10 +110,15 @@ class SceneTask(Task, InScene):
 
     state: State
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
-    horizon: int = eqx.field(static=True)
+    horizon: int = eqx.field(static=True, converter=functools.partial(whole, "horizon"))
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=as_pytree, default=None)
     observe: Observe | None = eqx.field(converter=as_pytree, default=None, kw_only=True)
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
+
+    def __check_init__(self):
+        function("cost", self.cost, "trajectory")
+        function("start_distribution", self.start_distribution, "key")
+        function("observe", self.observe, "model", "data")
 
     @property
     def num_controls(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -165,7 +169,7 @@ def checked_cost(cost: Any, horizon: int) -> Float[Array, "*steps"]:
     if not eqx.is_array_like(cost) or jnp.shape(cost) not in ((), (horizon + 1,)):
         wanted = f"a scalar of shape () or one number per state, shape ({horizon + 1},)"
         raise ValueError(f"the task's cost must return {wanted}, got {form(cost)}")
-    return jnp.asarray(cost)
+    return jnp.asarray(cost, jnp.result_type(cost, float))
 
 
 def finite_cost(cost: Float[Array, "*steps"], trajectory: Trajectory) -> Float[Array, "*steps"]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import form, instance, is_known, known, whole
+from mjxgrad._arrays import form, instance, is_known, known, real, whole
 from mjxgrad._mjx import mjx
 from mjxgrad.native import INPUTS, engine_of
 from mjxgrad.rollouts.state import State, check_scene
@@ -26,8 +26,8 @@ def sequence_of(
     controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
 ) -> tuple[Array | None, int]:
     """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
-    sequence = None if controls is None or callable(controls) else _real("controls", controls)
-    noise = None if noise is None else _real("noise", noise)
+    sequence = None if controls is None or callable(controls) else real("controls", controls)
+    noise = None if noise is None else real("noise", noise)
     horizon = _horizon(horizon, controls=sequence, noise=noise)
     for name, value in (("controls", sequence), ("noise", noise)):
         if value is None:
@@ -40,13 +40,6 @@ def sequence_of(
             row, column = np.argwhere(~np.isfinite(numbers))[0]
             raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")
     return sequence, horizon
-
-
-def _real(name: str, value: Any) -> Array:
-    dtype = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
-    if not jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.complexfloating):
-        raise ValueError(f"{name} must be real numbers, got {dtype}")
-    return jnp.asarray(value)
 
 
 def check_start(scene: Any, state: Any) -> None:
@@ -68,6 +61,9 @@ def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) 
         shape = (horizon, *getattr(scene.data, name).shape)
         if np.shape(value) != shape:
             raise ValueError(f"inputs[{name!r}] must have shape {shape}, one row per step, got {np.shape(value)}")
+        numbers = known(value)
+        if numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"inputs[{name!r}] must be finite, got {numbers[~np.isfinite(numbers)][0]}")
         found[name] = jnp.asarray(value, getattr(scene.data, name).dtype)
     return found
 

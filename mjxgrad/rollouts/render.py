@@ -15,9 +15,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mjxgrad._arrays import instance
+from mjxgrad._arrays import instance, whole
 from mjxgrad._text import write
-from mjxgrad.rollouts.state import Trajectory
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -63,8 +62,9 @@ def frames(
     """
     mj_model = scene.mj_model if isinstance(scene, Scene) else scene
     instance("scene", mj_model, mujoco.MjModel, "of mg.load_scene, or a mujoco.MjModel")
-    if isinstance(qpos, Trajectory):
-        raise ValueError("qpos must be positions, got a trajectory: give its .qpos")
+    if hasattr(qpos, "qpos"):
+        raise ValueError(f"qpos must be positions, got a {type(qpos).__name__.lower()}: give its .qpos")
+    height, width = whole("height", height, None), whole("width", width, None)
     if timestep is None:
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
     positions = np.asarray(qpos, dtype=np.float64)
@@ -124,8 +124,9 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     except ImportError as error:
         raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
+    instance("path", path, str | os.PathLike, "the path of a file")
     path, video = Path(path), np.asarray(video)
-    if video.ndim != 4 or not len(video):
+    if video.ndim != 4 or not len(video) or video.shape[3] != 3:
         raise ValueError(f"video must have shape (frames, height, width, 3), got {video.shape}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path must be in an existing folder, got {path}")
@@ -184,7 +185,9 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> "mujoco.Rend
     # MuJoCo, PyOpenGL, glfw and the drivers raise errors without a common class.
     except Exception as error:
         reason = str(error).partition(",")[0] or type(error).__name__
-        chosen = os.environ.get("MUJOCO_GL")
+        chosen = os.environ.get("MUJOCO_GL", "")
+        if chosen and chosen.lower().strip() not in ("egl", "glfw", "osmesa"):
+            raise RenderingUnavailableError(f"MUJOCO_GL must be egl, glfw, osmesa or unset, got {chosen}") from None
         alone = f" MUJOCO_GL={chosen} was tried alone: unset it and the others are, too." if chosen else ""
         raise RenderingUnavailableError(
             "rendering needs an OpenGL that works without a display, and none was found: install libosmesa6 (draws on "

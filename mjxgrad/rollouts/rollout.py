@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
+from mjxgrad._arrays import function, instance
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad.batched.cholesky import SOLUTION
@@ -88,7 +89,12 @@ def rollout(
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
         raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
+    function("observe", observe, "model", "data")
+    instance("checkpoint", checkpoint, bool, "True or False")
     policy = controls if callable(controls) else None
+    function("policy", policy, "params", "state")
+    if policy is None and params is not None:
+        raise ValueError("params must belong to a policy, got them beside a sequence of controls: give noise as noise=")
     sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
     forces = arguments.applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence

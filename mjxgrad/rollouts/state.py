@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import instance, is_known, known
+from mjxgrad._arrays import instance, is_known, known, real
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import geom_name
 from mjxgrad.scene import Scene, SceneWarning
@@ -107,7 +107,7 @@ def initial_state(
         keys = {name: getattr(scene.mj_model, f"key_{name}")[key] for name in ("qpos", "qvel", "act")}
     for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
         template = getattr(data, name)
-        part = jnp.asarray(keys.get(name, template) if given is None else given, template.dtype)
+        part = real(name, keys.get(name, template) if given is None else given, template.dtype)
         if part.shape != template.shape:
             raise ValueError(f"{name} must have shape {template.shape} in this scene, got {part.shape}")
         if is_known(part) and not np.isfinite(part).all():

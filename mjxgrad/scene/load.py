@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._arrays import instance
+from mjxgrad._arrays import instance, real, whole
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad._warnings import collected
 from mjxgrad.batched.device import own_device
@@ -79,7 +79,7 @@ def load_scene(
     """
     if softness is not None:
         instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
-    if max_contacts is not None and max_contacts < 1:
+    if max_contacts is not None and whole("max_contacts", max_contacts, None) < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:
         mj_model, name = _compile(source)
@@ -100,6 +100,7 @@ def load_scene(
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported)  # pyright: ignore[reportArgumentType]
     messages = [f"MuJoCo says: {text}" for text in told]
+    messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
     messages += [f"C MuJoCo steps it: {unsupported}"] if unsupported and engine is None else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
@@ -150,7 +151,7 @@ def count_pairs(model: mujoco.MjModel) -> int:
 
 def _set_timestep(model: mujoco.MjModel, name: str, timestep: float | None) -> None:
     if timestep is not None:
-        if not (math.isfinite(timestep) and timestep > 0):
+        if not (math.isfinite(real("timestep", timestep)) and timestep > 0):
             raise ValueError(f"timestep must be positive, in seconds, got {timestep!r}")
         model.opt.timestep = timestep
     elif not (math.isfinite(model.opt.timestep) and model.opt.timestep > 0):

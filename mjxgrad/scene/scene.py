@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import instance, is_known
+from mjxgrad._arrays import instance, is_known, real
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants
@@ -28,7 +28,7 @@ from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
 _OPTIONS = ("timestep", "gravity", "wind")
-_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "dof_armature", "timestep"}
+_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pair_friction", "dof_armature", "timestep"}
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
@@ -105,6 +105,7 @@ class Scene(eqx.Module):
         every = numbers_of(self.model)
         options = {name: every[f"opt.{name}"] for name in _OPTIONS}
         arrays = {name: value for name, value in every.items() if "." not in name} | options
+        fields = {name: real(name, value) for name, value in fields.items()}
         for name, value in fields.items():
             if name not in arrays:
                 near = difflib.get_close_matches(name, arrays, n=3)
@@ -114,10 +115,11 @@ class Scene(eqx.Module):
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
         # Not jnp, which jit would trace.
-        known = {name: np.asarray(value).min(initial=np.inf) for name, value in changed.items() if is_known(value)}
-        for name, least in known.items():
-            if np.isnan(least):
-                raise ValueError(f"{name} must hold numbers, got NaN")
+        known = {name: np.asarray(value) for name, value in changed.items() if is_known(value)}
+        for name, numbers in known.items():
+            least, most = numbers.min(initial=np.inf), numbers.max(initial=0)
+            if np.isnan(least) or (name in _NOT_NEGATIVE and most == np.inf):
+                raise ValueError(f"{name} must hold numbers, got {'NaN' if np.isnan(least) else 'infinity'}")
             if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
                 raise ValueError(f"{name} must {requirement}, got {least:g}")

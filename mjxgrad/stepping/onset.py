@@ -60,6 +60,7 @@ References:
 """
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -108,7 +109,7 @@ class Onset(eqx.Module):
             MuJoCo's default is 0.1 mm). It bounds the derivative where contacts chatter; 0 sets no bound.
     """
 
-    width: Float[Array, "..."] = eqx.field(converter=as_float, default=0.1)
+    width: Float[Array, "..."] = eqx.field(converter=functools.partial(as_float, name="width"), default=0.1)
 
     def __check_init__(self):
         if is_known(self.width) and not np.all((np.asarray(self.width) >= 0) & np.isfinite(self.width)):

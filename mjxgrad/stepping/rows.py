@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._arrays import instance
 from mjxgrad._mjx import mjx
 from mjxgrad.batched import linear, maps
 from mjxgrad.batched.maps import safe_norm
@@ -243,6 +244,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
 
 def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
     """Return the index of a named body, joint, geom, site, sensor or actuator; refuse an unknown name."""
+    instance("model", model, mjx.Model | mujoco.MjModel, "MJX's, as scene.model")
     word = kind.name.removeprefix("mjOBJ_").lower()
     count = {"joint": "njnt", "actuator": "nu"}.get(word, f"n{word}")
     names = [mjx.id2name(model, kind, index) for index in range(getattr(model, count))]

@@ -65,7 +65,7 @@ class Smoothing(eqx.Module):
             without smoothing, and takes the derivative of the smoothed step at each visited state.
     """
 
-    length: Float[Array, "..."] = eqx.field(converter=as_float)
+    length: Float[Array, "..."] = eqx.field(converter=functools.partial(as_float, name="length"))
     # A plain string, so that unknown names reach the check below, which lists the choices.
     mode: str = eqx.field(static=True, default="forward")
 

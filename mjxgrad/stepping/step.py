@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float, Int
 
-from mjxgrad._arrays import is_known_to_be
+from mjxgrad._arrays import instance, is_known_to_be
 from mjxgrad._mjx import mjx
 from mjxgrad.batched import cholesky
 from mjxgrad.bodies import forces, kinematics, mended
@@ -39,6 +39,8 @@ _Integrator = mujoco.mjtIntegrator
 
 @contextlib.contextmanager
 def _at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
+    instance("model", model, mjx.Model, "MJX's, as scene.model; for a scene and a state see mg.rollout")
+    instance("data", data, mjx.Data, "MJX's, as scene.data; for a scene and a state see mg.rollout")
     if not hasattr(data._impl, "efc_J") or not hasattr(model.opt._impl, "has_fluid_params"):
         raise ValueError(
             "model and data must be of MJX's JAX implementation, got "
@@ -71,18 +73,13 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
         NotImplementedError: if MJX lacks the integrator.
     """
     check_contact(contact, is_step=True)
-    if not (hasattr(model, "opt") and hasattr(data, "ctrl")):
-        given = f"{type(model).__name__} and {type(data).__name__}"
-        raise ValueError(
-            f"a step takes MJX's model and data, as scene.model and scene.data, got {given}; see mg.rollout"
-        )
-    if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
-        kind = model.opt.integrator
-        raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
-    has_stages = model.opt.integrator == _Integrator.mjINT_RK4
-    ways: tuple[Callable, Callable] = (_stages, _after_stages) if has_stages else (_forward, _after_one)
-    evaluate, finish = ways
     with _at_full_precision(model, data):
+        if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
+            kind = model.opt.integrator
+            raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
+        has_stages = model.opt.integrator == _Integrator.mjINT_RK4
+        ways: tuple[Callable, Callable] = (_stages, _after_stages) if has_stages else (_forward, _after_one)
+        evaluate, finish = ways
         if not isinstance(contact, Slope):
             return finish(model, data, evaluate(model, data, contact))
         fixed, still = jax.lax.stop_gradient((model, data))

@@ -13,7 +13,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.checking import findings
-from mjxgrad.checking.figure import telling
+from mjxgrad.checking.check import telling
 from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
 from mjxgrad.checking.measure import Line, Measured, crossing, estimates, measure
 from mjxgrad.checking.motions import KINDS, REFINED, Direction, Moved, Mover, most_contacts, random_motions

@@ -177,7 +177,7 @@ def test_costs_by_name_are_what_c_mujoco_says(folder):
         (["block.xml", "--cost", "none.py:reward"], "there is no file none.py"),
         (["block.xml", "--cost", "costs.py:rewards"], "costs.py has no function 'rewards', but reward, all_of_it"),
         (["block.xml", "--cost", "costs.py:all_of_it"], "cost must return a scalar of shape ()"),
-        (["block.xml", "--cost", "broken.py:cost"], "'broken.py:cost': invalid syntax"),
+        (["block.xml", "--cost", "broken.py:cost"], "'broken.py:cost' raised SyntaxError: invalid syntax"),
         (["block.xml", "--cost", "height:blok"], "there is no body or site 'blok' in the scene, but body: world"),
         (["block.xml", "--cost", "reach:block"], "reach is of two, as reach:hand/ball, got 'block'"),
         (["block.xml", "--cost", "hight:block"], "cost must be file.py:function, module:function, or of a body as"),

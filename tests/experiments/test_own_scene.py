@@ -42,6 +42,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "block.xml").write_text(BLOCK)
     (tmp_path / "costs.py").write_text("def reward(trajectory):\n    return (trajectory.qpos[-1, 0] + 0.1) ** 2\n")
+    (tmp_path / "broken.py").write_text("def reward(trajectory):\n    return (trajectory\n")
     (tmp_path / "own.toml").write_text(SETTINGS)
     return tmp_path
 
@@ -63,7 +64,23 @@ def test_bias_and_variance_are_measured_and_a_changed_cost_is_run_again(folder, 
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("scene=nowhere.xml", "scene: there is no file nowhere.xml"),
+        ("scene=nowhere.xml", "scene: there is no file 'nowhere.xml'"),
+        ("scene=nowhere", "scene: there is no file 'nowhere'"),
+        ('scene=""', "scene: there is no file ''"),
+        ("scene=3", "scene: must be string, got 3"),
+        ("scene=costs.py", "costs.py must be MJCF that MuJoCo accepts, but it says: XML parse error"),
+        ("cost=nowhere.py:reward", "cost: there is no file nowhere.py"),
+        ("cost=costs.py", "cost: must be file.py:function, module:function or height:body, got 'costs.py'"),
+        ("cost=broken.py:reward", "cost: broken.py is not Python: '(' was never closed (broken.py, line 2)"),
+        ("cost=3", "cost: must be string, got 3"),
+        ("cost=height:blok", "there is no body or site 'blok' in the scene, but body: world, block"),
+        ("start=far", "keyframe must be one of ['near'] in this scene, got 'far'"),
+        ("start=0", "start: must be string, got 0"),
+        ("horizon=-1", "horizon: must be greater than or equal to 1, got -1"),
+        ("stiffness=1e3", "stiffness: must be array, got 1000.0"),
+        ("stiffness=[1e3,-1e3]", "stiffness[1]: must be greater than 0, got -1000.0"),
+        ("confidence=95", "confidence: must be less than 1, got 95"),
+        ("precision=double", 'precision: there is no "double"; choose one of float32, float64'),
         ("cost=costs.py:rewrd", "costs.py has no function 'rewrd', but reward"),
         ("horizn=3", 'horizn: unknown key; did you mean "horizon"?'),
     ],

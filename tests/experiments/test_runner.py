@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import re
 import shutil
 import signal
@@ -243,15 +242,6 @@ def test_a_gallery_shows_each_result_by_its_answer_and_picture_and_names_what_it
     picture = re.search(r'<img src="([^"]*)"', second)
     assert picture is not None
     assert (top / picture[1]).is_file()
-
-
-def test_a_choice_of_opengl_that_mujoco_does_not_know_is_a_sentence(tmp_path):
-    """MuJoCo cannot even be imported under it."""
-    command = [sys.executable, "-m", "experiments", "run", "ramp", "--output", str(tmp_path)]
-    environment = {**os.environ, "MUJOCO_GL": "bogus"}
-    result = subprocess.run(command, env=environment, cwd=runner.ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 2
-    assert result.stderr.endswith('MUJOCO_GL: bogus; unset it, or take "egl", "osmesa" or "glfw"\n')
 
 
 # A whole kind, of two parts, that kills itself in the second one, once; `warnings` is a module here, and no sentence.

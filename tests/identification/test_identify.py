@@ -30,6 +30,41 @@ def cart():
     return mg.load_scene(_CART)
 
 
+def _interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
+def _noisy():
+    """A course at a gear of 3.3, with ten times the noise that is stated."""
+    measured = _course(gear=3.3) + 0.01 * np.random.default_rng(0).normal(size=_STEPS + 1)
+    return Recording({"place": measured}, _DRIVE[:, None], noise={"place": 0.001})
+
+
+def test_an_interrupted_search_returns_the_best_values_so_far(cart):
+    """After its first step, which is the nominal value; a second Ctrl-C is not needed."""
+    gear = {"gear": identification.gear(cart, "motor")}
+    result = mg.identify(cart, gear, [_noisy()], held_out=[_noisy()], log=_interrupted)
+    assert result.stopped is Stopped.INTERRUPTED
+    assert result.num_steps == 1
+    assert np.isfinite(result.half_width["gear"])
+    assert "interrupted: do not trust" in result.headline
+
+
+@pytest.mark.parametrize("part", ["searched", "_descend"])
+def test_an_interruption_of_the_second_search_keeps_the_first_ones_values(cart, monkeypatch, part):
+    from mjxgrad.identification import search
+
+    if part == "searched":
+        monkeypatch.setattr(search._Program, "searched", _interrupted)
+    else:
+        monkeypatch.setattr(search._Program, "searched", lambda program: program.start())
+        calls = iter([search._descend, _interrupted])
+        monkeypatch.setattr(search, "_descend", lambda *given: next(calls)(*given))
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [_noisy()])
+    assert result.stopped is Stopped.INTERRUPTED
+    np.testing.assert_allclose(result.values["gear"], 3.3, atol=0.1)
+
+
 def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     """The place is the gear times a known course, here between the steps and with noise: a regression through the origin."""
     rng = np.random.default_rng(0)

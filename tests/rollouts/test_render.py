@@ -1,5 +1,9 @@
 """Drawing: on a machine without OpenGL the refusal is tested in place of the pictures."""
 
+import os
+import subprocess
+import sys
+
 import mujoco
 import numpy as np
 import pytest
@@ -130,6 +134,24 @@ def test_a_choice_of_opengl_that_fails_is_named(model, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "egl")
     with pytest.raises(RenderingUnavailableError, match=r"libosmesa6 .* MUJOCO_GL=egl was tried alone: unset it"):
         frames(model, np.zeros((1, model.nq)))
+
+
+_DRAWN = """
+import mjxgrad as mg
+
+scene = mg.load_scene("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+try:
+    mg.render.frames(scene, scene.data.qpos[None])
+except mg.render.RenderingUnavailableError as error:
+    print(error)
+"""
+
+
+def test_a_choice_of_opengl_that_mujoco_does_not_know_is_told_where_it_is_needed():
+    """MuJoCo alone cannot even be imported under it."""
+    environment = {**os.environ, "MUJOCO_GL": "foo"}
+    done = subprocess.run([sys.executable, "-c", _DRAWN], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "MUJOCO_GL must be egl, glfw, osmesa or unset, got foo\n"
 
 
 _WITHOUT_OPENGL = """
