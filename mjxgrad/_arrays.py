@@ -1,5 +1,6 @@
 """Known values of traced arrays, and checks of arguments."""
 
+import contextlib
 import inspect
 import operator
 from typing import Any
@@ -16,16 +17,18 @@ def as_float(value: Any, name: str = "softness") -> Any:
 
 
 def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
-    """Return real numbers as an array; refuse text, objects and ragged lists."""
+    """Return real numbers as an array, known where they are given so; refuse text, objects and ragged lists."""
+    is_traced = isinstance(value, jax.core.Tracer)
     try:
         kind = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
     except jax.errors.TracerArrayConversionError:  # a list of traced numbers
-        kind = jnp.asarray(value).dtype
+        kind, is_traced = jnp.asarray(value).dtype, True
     except (TypeError, ValueError):
         kind = np.dtype(object)
     if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
         raise ValueError(f"{name} must be real numbers, got {type(value).__name__ if kind.kind in 'OU' else kind}")
-    return jnp.asarray(value, dtype)
+    with contextlib.nullcontext() if is_traced else jax.ensure_compile_time_eval():
+        return jnp.asarray(value, dtype)
 
 
 def known(values: Any) -> np.ndarray | None:

@@ -471,6 +471,7 @@ FOUND = {
     "roll(np.zeros((2, 1), np.float64))": "no error",
     "jax.jit(jax.jit(lambda x: mg.initial_state(scene, qpos=[x[0]])))(params)": "no error",
     "mg.Softness(stiffness=10**10)": "no error",
+    "jax.jit(lambda: mg.learning.Settings().trace)()": "no error",
     "fit.Recording({'qpos': [0, 1, 2]}, [[0], [1]])": "no error",
 }  # fmt: skip
 

@@ -3,6 +3,8 @@
 import dataclasses
 from collections.abc import Sequence
 
+import numpy as np
+
 from mjxgrad._arrays import instance, real, whole
 from mjxgrad.batched.device import is_gpu
 
@@ -58,14 +60,14 @@ class Settings:
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             whole(name, getattr(self, name))
         for name in ("actor_scale", "actor_rate", "critic_rate", "largest_sample"):
-            if not real(name, getattr(self, name)) > 0:
+            if not np.asarray(real(name, getattr(self, name))) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("actor_layers", "critic_layers"):
             instance(name, getattr(self, name), Sequence, "a tuple of hidden sizes, such as (64, 64)")
         if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
             raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
         for name in ("discount", "trace", *(["alpha"] if self.alpha is not None else [])):
-            if not 0 <= real(name, getattr(self, name)) <= 1:
+            if not 0 <= np.asarray(real(name, getattr(self, name))) <= 1:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
         if self.trace < 1 and not self.has_critic:
             raise ValueError(
