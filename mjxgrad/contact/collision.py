@@ -42,10 +42,16 @@ _Points = Float[Array, "pairs 3"]
 _Point, _Polygon = Float[Array, "3"], Float[Array, "_ 3"]
 _Pairs = Int[Array | np.ndarray, "pairs 2"]
 # Plain integers: the numbers in MJX's keys do not equal members of an enumeration.
-_PLANE, _HEIGHT_FIELD, _SPHERE, _BOX, _CYLINDER, _MESH = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "HFIELD", "SPHERE", "BOX", "CYLINDER", "MESH")
+_PLANE, _HEIGHT_FIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _BOX, _CYLINDER, _MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+    for name in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "BOX", "CYLINDER", "MESH")
 )
 CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
+_OF_ROUND = {
+    _SPHERE: 1,
+    _ELLIPSOID: 1,
+    _CAPSULE: 2,
+}  # contacts with another convex geom; of flat faces C MuJoCo finds four
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """Types without a bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
@@ -116,7 +122,11 @@ def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
 def most_contacts(kinds: tuple[SupportsInt, SupportsInt]) -> int:
     """Return the largest number of contacts of a pair of geoms of two types."""
     first, second = map(int, kinds)
-    return boxes.NUM_CONTACTS if (first, second) == (_BOX, _BOX) else _MJX_FUNCTIONS[first, second].ncon  # pyright: ignore
+    if (first, second) == (_BOX, _BOX):
+        return boxes.NUM_CONTACTS
+    if (first, second) in _MJX_FUNCTIONS:
+        return _MJX_FUNCTIONS[first, second].ncon  # pyright: ignore
+    return min(_OF_ROUND.get(kind, 4) for kind in (first, second))  # C MuJoCo's, which alone steps such pairs
 
 
 def slot_dims(model: mjx.Model) -> Int[np.ndarray, " contacts"]:
