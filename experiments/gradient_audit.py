@@ -29,7 +29,7 @@ from mjxgrad.learning.window import Gradients, Window, returned, run_window, win
 from mjxgrad.stepping import Contact
 
 _KINDS = {"own": mg.Discrete(), "slope": mg.Slope(), "onset": mg.Onset()}
-_LIMITS = (math.inf, 0.3, 0.1)
+_LIMITS = (0.3, 0.1)
 _MIXED = 96  # actions by which copies of a state are driven apart
 _LONG = 192  # actions of the long return, which the value function ends
 _WIDTH = 0.05  # rms change of the actions, of the central differences
@@ -44,6 +44,7 @@ def gradient_audit(
     updates: int = 300,
     environments: int = 64,
     windows: int = 4096,
+    starts: int = 4096,
     batches: tuple[int, ...] = (64, 256, 1024),
     traces: tuple[float, ...] = (1.0, 0.8),
     seed: int = 0,
@@ -57,6 +58,7 @@ def gradient_audit(
         updates: updates after which the policy is frozen.
         environments: copies in which it learned.
         windows: windows of which directions are made; the reference is from as many others.
+        starts: number of those whose long returns tell the slope.
         batches: numbers of windows whose directions are compared with the reference.
         traces: each λ of the blended adjoint.
         seed: of everything.
@@ -70,11 +72,11 @@ def gradient_audit(
     print(learned, flush=True)
     frozen = _Frozen(learned, task, settings)
     keys = jax.random.split(jax.random.key(seed + 1), 4)
-    starts, others = (jax.jit(lambda k: frozen.starts(k, windows))(key) for key in keys[:2])
+    states, others = (jax.jit(lambda k: frozen.starts(k, windows))(key) for key in keys[:2])
     noise = jax.random.normal(keys[2], (windows, settings.window, task.num_actions))
     found, references = {}, {}
-    for (name, trace), program in frozen.compiled(traces, starts, noise).items():
-        window, gradients = program(starts, noise)
+    for (name, trace), program in frozen.compiled(traces, states, noise).items():
+        window, gradients = program(states, noise)
         other_window, other = program(others, noise[::-1])
         for limit in _LIMITS:
             found[name, trace, limit] = window.seen, gradients.sound.shortened(limit)[0].first
@@ -84,13 +86,14 @@ def gradient_audit(
         references["zeroth", trace] = frozen.direction(other_window.seen, other.zeroth)
     reference = jnp.stack([one / jnp.linalg.norm(one) for one in references.values()]).mean(axis=0)
     rise = jax.jit(frozen.rise)
-    long_noise = jax.random.normal(keys[3], (windows, _LONG, task.num_actions))
+    first = jax.tree.map(lambda x: x[:starts], states)
+    long_noise = jax.random.normal(keys[3], (windows, _LONG, task.num_actions))[:starts]
     heads = ["gradient", "λ", "limit", *(f"cosine, {size}" for size in batches), "slope"]
     print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
     for (name, trace, limit), (seen, by_action) in sorted(found.items()):
         cosines = [_cosines(frozen, seen, by_action, size, reference) for size in batches]
-        rises = np.asarray(rise(frozen.direction(seen, by_action), starts, long_noise))
-        told = [quantity(rises.mean(), rises.std(ddof=1) / math.sqrt(windows))]
+        rises = np.asarray(rise(frozen.direction(seen, by_action), first, long_noise))
+        told = [quantity(rises.mean(), rises.std(ddof=1) / math.sqrt(len(rises)))]
         told = [quantity(x.mean(), x.std(ddof=1) / math.sqrt(len(x))) for x in cosines] + told
         print(f"| {' | '.join([name, f'{trace:g}', f'{limit:g}', *told])} |", flush=True)
 

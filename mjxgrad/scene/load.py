@@ -101,7 +101,9 @@ def load_scene(
     scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported)  # pyright: ignore[reportArgumentType]
     messages = [f"MuJoCo says: {text}" for text in told]
     messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
-    messages += [f"C MuJoCo steps it: {unsupported}"] if unsupported and engine is None else []
+    head, *more = unsupported.splitlines() or [""]
+    reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [head])
+    messages += [f"C MuJoCo steps it: {reasons}; see scene.unsupported"] if unsupported and engine is None else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
