@@ -1,6 +1,7 @@
 """PPO by brax: what a policy learns from as many steps without any derivative of the physics."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -51,6 +52,8 @@ def learn_ppo(
     """
     ppo, networks, environment_of_brax = load()
     how = _HOW | _OWN.get(name, {})
+    # A part between two readings has a batch at least.
+    num_batches = num_steps // math.prod(how[each] for each in ("batch_size", "num_minibatches", "unroll_length"))
     readings: list[tuple[float, float, float]] = []
 
     def note(steps: int, metrics: dict[str, Any]) -> None:
@@ -64,7 +67,7 @@ def learn_ppo(
         episode_length=environment.episode_length,
         normalize_observations=True,
         network_factory=functools.partial(networks.make_ppo_networks, **_LAYERS.get(name, {})),
-        num_evals=_READINGS + 1,
+        num_evals=1 + min(_READINGS, max(1, num_batches)),
         num_eval_envs=64,
         deterministic_eval=True,
         progress_fn=note,
