@@ -81,15 +81,6 @@ def test_a_jump_between_samples_is_always_seen():
     assert accepted < 0.01
 
 
-def test_at_a_jump_it_is_as_unbiased_as_zeroth_order(key):
-    objective = parameter_noise(textbook.step, 0.1, dim=1)
-    estimate = alpha_order(objective, jnp.array([0.05]), key, num_samples=20_000)
-    assert estimate.alpha == 0
-    assert estimate.bias_bound == 0
-    assert Reason[estimate.reason] == Reason[Reason.inconsistent]
-    textbook.assert_within_error(estimate, norm.pdf(0.05, scale=0.1))
-
-
 def test_the_bound_on_the_bias_holds_for_a_small_jump_in_many_dimensions(key):
     """A jump of 0.05 in one of 40 coordinates passes the test; its bias is 0.05 φ(0)/σ, its bound sd(J)/σ."""
     slope = jnp.linspace(1, 2, 40)

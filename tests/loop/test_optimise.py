@@ -52,11 +52,6 @@ def test_every_rollout_of_the_method_is_counted_and_none_of_the_measurement(zero
     assert run(jax.random.key(0), problems.first_order).num_gradient_rollouts == 4 * 30
 
 
-def test_steps_that_fill_up_the_last_segment_do_nothing(zeroth_order_run):
-    assert zeroth_order_run.num_steps == 250
-    assert zeroth_order_run.history.cost.shape == (250,)
-
-
 def test_the_noise_free_cost_is_measured_when_it_is_due(zeroth_order_run):
     is_measured = np.isfinite(zeroth_order_run.history.noise_free_cost)
     np.testing.assert_array_equal(np.flatnonzero(is_measured), np.arange(0, 250, 7))

@@ -25,14 +25,6 @@ STDDEVS = jnp.array([0.1, 0.2, 0.3])
 POINT = jnp.array([0.3, 0.1, -0.5])
 
 
-def test_a_linear_cost_is_found_exactly(key):
-    slope = jnp.array([1.0, -2.0, 0.5])
-    estimate = least_squares(parameter_noise(lambda x: 7 + slope @ x, STDDEVS), POINT, key, num_samples=6)
-    np.testing.assert_allclose(estimate.value, slope, rtol=1e-10)
-    np.testing.assert_array_less(estimate.standard_error, 1e-10)
-    assert estimate.num_gradient_rollouts == 0
-
-
 def test_it_is_numpys_fit_to_the_same_samples_chunks_and_missing_ones_included(key):
     def cost(x):
         return jnp.where(x[2] > -0.3, jnp.nan, textbook.bumpy(x))
@@ -43,6 +35,7 @@ def test_it_is_numpys_fit_to_the_same_samples_chunks_and_missing_ones_included(k
     costs = np.array([cost(POINT + w) for w in noise])
     kept = np.isfinite(costs)
     assert estimate.num_finite == kept.sum() < 50
+    assert estimate.num_gradient_rollouts == 0
     design = np.column_stack([np.ones(kept.sum()), noise[kept]])
     fit, *_ = np.linalg.lstsq(design, costs[kept])
     np.testing.assert_allclose(estimate.value, fit[1:], rtol=1e-9)
@@ -104,16 +97,6 @@ def test_reward_to_go_spares_a_late_action_the_variance_of_what_came_before(key)
     ratio = reinforce(cost, at, key, num_samples=4000).covariance_diagonal / whole.covariance_diagonal
     assert abs(ratio[0] - 1) < 0.01
     assert ratio[-1] < 0.3
-
-
-def test_the_error_bar_of_reinforce_is_the_spread_of_its_repetitions(key):
-    """2000 estimates of 30 rollouts; the spread of 2000 is known to about 1.6 %, and the share left out is 1/30."""
-    cost = closed_loop()
-    at = cost.ravel(POLICY)
-    repeated = eqx.filter_jit(jax.vmap(lambda k: estimators.reinforce(cost, at, k, num_samples=30)))
-    estimates = repeated(jax.random.split(key, 2000))
-    claimed = np.sqrt((np.asarray(estimates.standard_error) ** 2).mean(axis=0))
-    np.testing.assert_allclose(claimed, np.asarray(estimates.value).std(axis=0), rtol=0.1)
 
 
 def test_reinforce_leaves_out_and_counts_what_is_not_finite(key):
