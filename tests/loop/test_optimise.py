@@ -14,9 +14,8 @@ from IPython.lib.pretty import pretty
 import mjxgrad as mg
 from mjxgrad import estimators
 from tests.loop import problems
-from tests.loop.problems import CENTRE, CURVATURE, STDDEV, made_up
+from tests.loop.problems import CENTRE, CURVATURE, START, STDDEV, made_up
 
-START = jnp.array([0.0, 0.5])
 SGD = optax.sgd(0.1)
 
 
