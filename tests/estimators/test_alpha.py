@@ -12,11 +12,9 @@ from mjxgrad.estimators import Diagnosis, Reason, rules
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.test_control_variate import assert_unbiased_with_right_errors
-from tests.estimators.textbook import repeat
+from tests.estimators.textbook import POINT, STDDEVS, repeat
 
 alpha_order = eqx.filter_jit(estimators.alpha_order)
-STDDEVS = jnp.array([0.1, 0.2, 0.3])
-POINT = jnp.array([0.3, 0.1, -0.5])
 BUMPY = parameter_noise(textbook.bumpy, STDDEVS)
 
 

@@ -11,7 +11,7 @@ import pytest
 from mjxgrad import estimators
 from mjxgrad.objective import closed_loop, open_loop, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import STDDEV, assert_within_error, first_order, zeroth_order
+from tests.estimators.textbook import CONTROLS, POLICY_PARAMS, STDDEV, assert_within_error, first_order, zeroth_order
 
 N = 40_000
 # On all of the problems below α-order must be as right as the unbiased ones, whichever part it chooses.
@@ -24,8 +24,6 @@ ESTIMATORS = {
 }
 RAMP = textbook.ramp(0.03)
 SINGLE = (RAMP, textbook.quadratic_sine, textbook.step)
-POLICY = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
-CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
 
 
 class OneOf(eqx.Module):
@@ -59,8 +57,8 @@ def noise_of_each_parameter():
 def a_policy():
     """A linear system under a linear policy: mean and covariance, so the expected cost, by recursion."""
     task = textbook.LinearSystem()
-    objective = closed_loop(task, textbook.linear_policy, 0.3, params=POLICY)
-    at = objective.ravel(POLICY)
+    objective = closed_loop(task, textbook.linear_policy, 0.3, params=POLICY_PARAMS)
+    at = objective.ravel(POLICY_PARAMS)
     return objective, at, jax.jit(jax.grad(lambda p: task.expected_cost(objective.unravel(p), 0.3)))(at)
 
 

@@ -13,6 +13,10 @@ from mjxgrad.objective.task import Outcome
 from mjxgrad.tasks import Task
 
 STDDEV = 0.1
+# Of `bumpy`, and of the linear system.
+POINT, STDDEVS = jnp.array([0.3, 0.1, -0.5]), jnp.array([0.1, 0.2, 0.3])
+POLICY_PARAMS = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
 
 # Compiled as a whole: one compilation each in place of some thirty small ones.
 first_order = eqx.filter_jit(estimators.first_order)

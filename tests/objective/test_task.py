@@ -11,7 +11,8 @@ from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import SceneTask
 from tests.estimators import textbook
-from tests.objective.test_objective import POLICY_PARAMS, STDDEV
+from tests.estimators.textbook import POLICY_PARAMS
+from tests.objective.test_objective import STDDEV
 
 
 @pytest.fixture

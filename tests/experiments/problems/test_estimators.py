@@ -15,14 +15,11 @@ from mjxgrad.estimators import Reason
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.test_rules import assert_decides, evidence
-from tests.estimators.textbook import assert_within_error
+from tests.estimators.textbook import POINT, POLICY_PARAMS, STDDEVS, assert_within_error
 
-POLICY = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
 CONTROLS = jnp.array([0.4, -0.7, 0.2, 0.9])
 reinforce = eqx.filter_jit(estimators.reinforce)
 least_squares = eqx.filter_jit(estimators.least_squares)
-STDDEVS = jnp.array([0.1, 0.2, 0.3])
-POINT = jnp.array([0.3, 0.1, -0.5])
 
 
 def test_it_is_numpys_fit_to_the_same_samples_chunks_and_missing_ones_included(key):
@@ -57,18 +54,18 @@ def test_too_few_samples_and_noise_that_is_not_on_the_parameters_are_refused(key
         estimators.least_squares(parameter_noise(textbook.bumpy, STDDEVS), POINT, key, num_samples=4)
     objective = closed_loop()
     with pytest.raises(ValueError, match="noise on the parameters"):
-        estimators.least_squares(objective, objective.ravel(POLICY), key, num_samples=40)
+        estimators.least_squares(objective, objective.ravel(POLICY_PARAMS), key, num_samples=40)
 
 
 def closed_loop(stddev=0.3):
-    return mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, stddev, params=POLICY)
+    return mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, stddev, params=POLICY_PARAMS)
 
 
 @pytest.mark.parametrize("baseline", ["leave_one_out", "none"])
 def test_reinforce_is_unbiased_for_a_policy(key, baseline):
     """Mean and covariance of a linear system under a linear policy follow by recursion, and so the expected cost."""
     cost = closed_loop()
-    at = cost.ravel(POLICY)
+    at = cost.ravel(POLICY_PARAMS)
     exact = jax.jit(jax.grad(lambda p: cost.task.expected_cost(cost.unravel(p), 0.3)))(at)
     assert_within_error(reinforce(cost, at, key, num_samples=100_000, baseline=baseline), exact)
 
