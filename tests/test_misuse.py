@@ -342,7 +342,7 @@ FOUND = {
     "mg.SceneTask(scene, state, len, 2, observe=3)": "observe must be a function of model and data, got int",
     "mg.closed_loop(course, mg.linear_policy(2, 1), 0.1)": "policy must be a function of params and state, got tuple",
     "mg.parameter_noise(3, 0.1)": "function must be a function of params, got int",
-    "mg.parameter_noise(0.1, lambda x: x @ x)": "stddev must be real numbers, got function",
+    "mg.parameter_noise(0.1, lambda x: x @ x)": "function must be a function of params, got float",
     "mg.parameter_noise(lambda x, y: x @ y, 0.1)": "function must be a function of params, got function: missing",
     # Keys.
     "optimise(key=jax.random.PRNGKey(0))": "one leading axis, got uint32 of shape (2,)",
