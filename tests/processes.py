@@ -8,14 +8,14 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 
+def python(*arguments, **environment):
+    """Return the process of Python, on the CPU, when it has ended."""
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", **environment}
+    return subprocess.run([sys.executable, *arguments], env=environment, cwd=ROOT, capture_output=True, text=True)
+
+
 def run_python(*arguments, **environment):
-    """Return what Python wrote to both outputs on the CPU; an error there fails the test."""
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        env={**os.environ, "JAX_PLATFORMS": "cpu", **environment},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    """Return what Python wrote to both outputs; an error there fails the test."""
+    done = python(*arguments, **environment)
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr

@@ -11,17 +11,10 @@ from scipy.stats import norm
 import mjxgrad as mg
 from mjxgrad.baselines import cross_entropy
 from tests.estimators import textbook
+from tests.loop import problems
+from tests.loop.problems import START, bowl
 
-CENTRE = jnp.array([1.0, -2.0])
-START = jnp.array([0.0, 0.5])
-
-
-def bowl(x):
-    return ((x - CENTRE) ** 2 * jnp.array([0.5, 1.5])).sum()
-
-
-objective = mg.parameter_noise(bowl, 0.3, dim=2)
-
+objective = problems.objective.with_stddev(0.3)
 search = functools.partial(cross_entropy, num_samples=40, num_elite=8, stddev=2.0)
 
 

@@ -77,36 +77,6 @@ def test_any_part_can_be_imported_first():
     graphlib.TopologicalSorter(graph).prepare()
 
 
-def test_packages_that_are_named_are_imported():
-    """Lint cannot see it: names of shapes in annotations look like undefined ones."""
-    known = {
-        "mg",
-        "jax",
-        "jnp",
-        "np",
-        "eqx",
-        "mujoco",
-        "mjx",
-        "optax",
-        "plt",
-        "pd",
-        "xr",
-        "mjxgrad",
-        "math",
-        "os",
-        "sys",
-    }
-    missing = []
-    for path in [path for part in ("mjxgrad", "experiments", "tests") for path in (ROOT.parent / part).rglob("*.py")]:
-        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-        aliases = [alias for node in nodes if isinstance(node, ast.Import | ast.ImportFrom) for alias in node.names]
-        bound = {(alias.asname or alias.name).partition(".")[0] for alias in aliases}
-        bound |= {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
-        read = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)}
-        missing += [(path.name, name) for name in sorted(read & known - bound)]
-    assert not missing
-
-
 def _codes(code: types.CodeType) -> Iterator[types.CodeType]:
     yield code
     for part in code.co_consts:

@@ -13,9 +13,10 @@ _PROGRAM = """
     import jax.numpy as jnp
     import numpy as np
 
+    import experiments.benchmarks  # whose --per-core makes devices, too
     import mjxgrad as mg
 
-    jax.config.update("jax_num_cpu_devices", 8)  # which fails if importing mjxgrad has used a device
+    jax.config.update("jax_num_cpu_devices", 8)  # which fails if an import has used a device
 
 
     def root(x, start):  # a loop that each member leaves at its own time

@@ -8,9 +8,8 @@ import pytest
 
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import kinematics, orientation, tree
+from tests.bodies.test_kinematics import PLACED, PLACES, ROUNDING
 
-# Sums of some tens of products of numbers of order one, in another order.
-ROUNDING = 1e3 * np.finfo(float).eps
 # Two chains about skew axes; slides before, between and after hinges, two hinges on a body, opposite axes, rotations of bodies
 # that keep the axis and, at the tip, one that does not; bodies without joints on the world and on a chain.
 PLANAR = """
@@ -40,9 +39,7 @@ PLANAR = """
   </worldbody>
 </mujoco>
 """
-FIELDS = (
-    "xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat",
-)  # fmt: skip
+FIELDS = PLACES + PLACED
 # Under jax.jit numbers of an argument are not known, and turns are multiplied.
 by_products = jax.jit(kinematics.kinematics)
 

@@ -127,6 +127,18 @@ def test_what_a_budget_leaves_no_time_for_is_named():
     assert len(verdict.headline.split()) <= 15
 
 
+@pytest.fixture
+def measuring():
+    """From a mover to what is measured of a ball's motions, and to the advice that follows from what was measured."""
+    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
+    motions, stability = random_motions(scene, rng), mg.check_stability(scene, speed=1.0)
+
+    def measured_by(mover):
+        return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=lambda _: None)
+
+    return measured_by, lambda measured: recommend(scene, motions, stability, measured, None)
+
+
 class OutOfTime(Mover):
     """Motions that take no time for the first two questions, and for ever for the others."""
 
@@ -145,16 +157,14 @@ class OutOfTime(Mover):
         return Moved(outcomes, derivatives, np.ones(outcomes.shape[:2]), 0)
 
 
-def test_questions_that_there_is_no_time_for_are_left_out_by_name():
-    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
-    motions = random_motions(scene, rng)
-    measured = measure(scene, motions, OutOfTime(), rng, from_start=False, seconds=1, log=lambda _: None)
+def test_questions_that_there_is_no_time_for_are_left_out_by_name(measuring):
+    measured_by, advise = measuring
+    measured = measured_by(OutOfTime())
     assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
     (told,) = left_out_findings(measured, 60)
     for words in ("budget of 60 s", "a line along the controls", "noise of 0.3", "contacts at"):
         assert words in told.text
-    advice = recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None)
-    assert advice.gradient == "discrete"  # both are the slope
+    assert advise(measured).gradient == "discrete"  # both are the slope
     _, derivatives = telling(measured, ("speed",)).drawings
     assert derivatives.count('style="fill: #d55e00') == 33  # a dot for each motion, and a legend
 
@@ -180,11 +190,9 @@ class Rounding(OutOfTime):
 
 @pytest.mark.filterwarnings("ignore:Degrees of freedom:RuntimeWarning", "ignore:Mean of empty slice:RuntimeWarning")
 @pytest.mark.parametrize("diverges", [False, True])
-def test_rounding_is_no_jump_and_no_slope(diverges):
+def test_rounding_is_no_jump_and_no_slope(measuring, diverges):
     """One of two outcomes; along the controls neither is felt. Where all motions end in no number, what came before counts."""
-    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
-    motions, mover = random_motions(scene, rng), Rounding(diverges)
-    measured = measure(scene, motions, mover, rng, from_start=False, seconds=1, log=lambda _: None)
+    measured = measuring[0](Rounding(diverges))
     assert [len(line.jumps.places) for line in measured.lines] == [0, 0, 0]
     num_moving = sum(line.varied != "the controls" for line in measured.lines)
     readings = {slope.num_readings for slope in slopes(measured)}
@@ -220,13 +228,12 @@ class Endless(OutOfTime):
         return super().move(kind, states, controls, direction, lengths, contact)
 
 
-def test_what_outlasts_the_budget_is_given_up_and_named():
-    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
-    motions = random_motions(scene, rng)
-    measured = measure(scene, motions, Endless(), rng, from_start=False, seconds=1, log=lambda _: None)
+def test_what_outlasts_the_budget_is_given_up_and_named(measuring):
+    measured_by, advise = measuring
+    measured = measured_by(Endless())
     assert (measured.lines, measured.noises, len(measured.left_out)) == ((), (), 7)
     assert {finding.kind for finding in measured_findings(measured)} <= {"slope", "order", "note"}
-    assert recommend(scene, motions, mg.check_stability(scene, speed=1.0), measured, None).estimator == "alpha_order"
+    assert advise(measured).estimator == "alpha_order"
 
 
 def _moved(kind):
@@ -323,11 +330,9 @@ def test_a_derivative_that_is_off_or_too_scattered_to_tell_is_not_the_slope():
         (1 + 3000 * (np.arange(64) % 10 == 0), 1.0, "discrete"),
     ],
 )
-def test_what_is_recommended_is_what_was_measured(slope, discrete, expected):
+def test_what_is_recommended_is_what_was_measured(measuring, slope, discrete, expected):
     """MuJoCo's own derivative where it is the slope, else the slope, but not where its mean is that of a few."""
-    scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
-    motions, stability = random_motions(scene, rng), mg.check_stability(scene, speed=1.0)
-    assert recommend(scene, motions, stability, line_of(slope, discrete), None).gradient == expected
+    assert measuring[1](line_of(slope, discrete)).gradient == expected
 
 
 def test_a_slope_of_the_time_step_alone_is_named():

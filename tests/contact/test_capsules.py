@@ -11,7 +11,6 @@ from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.contact.capsules import parallel_below
 from mjxgrad.contact.collision import collide, slot_geoms
-from tests.scenes import central_difference
 
 # Margins beyond all distances, so that C MuJoCo reports every contact; two dimensions, so that two groups are of one type.
 SCENE = """
@@ -31,38 +30,43 @@ LEVEL, TILTED = SCENE.format(tilt=""), SCENE.format(tilt='euler="70 20 0"')
 BALLS, CAPSULES = (1, 2), (3, 4, 5)
 
 
-def _finder(xml):
+def finder(model, start):
+    """Return the function from positions to contacts."""
+    return jax.jit(lambda qpos: collide(model, kinematics(model, start.replace(qpos=qpos)))._impl.contact)
+
+
+def loaded(xml):
+    """Return C's model, the geoms of the slots, and the function from positions to contacts."""
     mj_model = mujoco.MjModel.from_xml_string(xml)
-    model = mjx.put_model(mj_model)
-    start = mjx.make_data(mj_model)
-    return (
-        mj_model,
-        slot_geoms(model, start),
-        jax.jit(lambda qpos: collide(model, kinematics(model, start.replace(qpos=qpos)))._impl.contact),
-    )
+    model, start = mjx.put_model(mj_model), mjx.make_data(mj_model)
+    return mj_model, slot_geoms(model, start), finder(model, start)
 
 
-def _poses(seed):
+def poses(seed, num_bodies=5, spread=0.2):
+    """Return random positions and turns of free bodies."""
     random = np.random.default_rng(seed)
-    quaternions = random.normal(size=(5, 4))
+    quaternions = random.normal(size=(num_bodies, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return np.concatenate([random.normal(scale=0.2, size=(5, 3)), quaternions], axis=1).ravel()
+    return np.concatenate([random.normal(scale=spread, size=(num_bodies, 3)), quaternions], axis=1).ravel()
+
+
+def by_pair_and_depth(geoms, contact, theirs):
+    """Return geoms, distances, places and normals, ours and C's: of a capsule's two ends C counts either first."""
+    found = (
+        np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]]),
+        np.column_stack([theirs.geom, theirs.dist, theirs.pos, theirs.frame[:, :3]]),
+    )
+    return (x[np.lexsort((x[:, 2].round(9), x[:, 1], x[:, 0]))] for x in found)
 
 
 def test_they_touch_where_they_do_in_c():
     """Contacts with planes to rounding, those of capsules to the fourth power of a ratio of a hundredth."""
-    mj_model, geoms, find = _finder(TILTED)
+    mj_model, geoms, find = loaded(TILTED)
     mj_data, num_clear = mujoco.MjData(mj_model), 0
     for seed in range(40):
-        mj_data.qpos[:] = _poses(seed)
+        mj_data.qpos[:] = poses(seed)
         mujoco.mj_forward(mj_model, mj_data)
-        contact, theirs = find(jnp.asarray(mj_data.qpos)), mj_data.contact
-        found = [
-            np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]]),
-            np.column_stack([theirs.geom, theirs.dist, theirs.pos, theirs.frame[:, :3]]),
-        ]
-        # By pair and depth: of a capsule's two ends C counts the deeper one first or second.
-        ours, theirs = (x[np.lexsort((x[:, 2].round(9), x[:, 1], x[:, 0]))] for x in found)
+        ours, theirs = by_pair_and_depth(geoms, find(jnp.asarray(mj_data.qpos)), mj_data.contact)
         first, second = ours[:, :2].astype(int).T
         np.testing.assert_array_equal(ours[:, :2], theirs[:, :2])
         np.testing.assert_allclose(ours[first == 0], theirs[first == 0], rtol=0, atol=1e-14)
@@ -77,38 +81,26 @@ def test_they_touch_where_they_do_in_c():
 
 def test_contacts_with_a_level_plane_are_those_of_mjx_and_on_a_tilted_one_tangents_are_at_right_angles():
     for xml in (LEVEL, TILTED):
-        mj_model, geoms, find = _finder(xml)
+        mj_model, geoms, find = loaded(xml)
         model, start = mjx.put_model(mj_model), mjx.make_data(mj_model)
         of_mjx = jax.jit(lambda qpos, m=model, d=start: mjx.collision(m, mjx.kinematics(m, d.replace(qpos=qpos))))
         for seed in range(20):
-            contact = find(jnp.asarray(_poses(seed)))
+            contact = find(jnp.asarray(poses(seed)))
             frames = contact.frame
             np.testing.assert_allclose(
                 frames @ np.swapaxes(frames, 1, 2), np.tile(np.eye(3), (18, 1, 1)), rtol=0, atol=1e-14
             )
             np.testing.assert_allclose(np.linalg.det(frames), 1, rtol=0, atol=1e-14)
             if xml is LEVEL:
-                theirs, on_plane = of_mjx(jnp.asarray(_poses(seed)))._impl.contact, geoms[:, 0] == 0
+                theirs, on_plane = of_mjx(jnp.asarray(poses(seed)))._impl.contact, geoms[:, 0] == 0
                 for name in ("dist", "pos", "frame"):
                     ours, own = (getattr(x, name)[on_plane] for x in (contact, theirs))
                     np.testing.assert_allclose(ours, own, rtol=0, atol=1e-13)
 
 
-def test_their_derivative_is_that_of_the_points():
-    _, _, find = _finder(TILTED)
-
-    def outcome(qpos):
-        contact = find(qpos)
-        return jnp.concatenate([contact.dist, contact.pos.ravel(), contact.frame.ravel()])
-
-    both = jax.jit(lambda qpos: (jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5)))
-    for seed in range(4):
-        np.testing.assert_allclose(*both(jnp.asarray(_poses(seed))), rtol=0, atol=1e-6)
-
-
 def test_a_ball_that_turns_changes_nothing():
     """Side by side, where the nearest point is at the very middle of what has no length."""
-    *_, find = _finder(LEVEL)
+    *_, find = loaded(LEVEL)
     still = np.array([1.0, 0, 0, 0])
     qpos = np.concatenate([[x, 0, 1, *still] for x in (0.0, 0.5, 1.0, 1.5, 2.0)])
     slope = jax.jacrev(lambda q: jnp.column_stack([(c := find(q)).dist, c.pos, c.frame[:, 0]]))(jnp.asarray(qpos))
@@ -120,7 +112,7 @@ def test_a_ball_that_turns_changes_nothing():
 
 def test_parallel_capsules_and_balls_in_one_place_have_derivatives():
     """Capsules side by side: by what moves them apart the distance grows, by what moves them along not."""
-    _, geoms, find = _finder(LEVEL)
+    _, geoms, find = loaded(LEVEL)
     still = np.array([1.0, 0, 0, 0])
     qpos = np.concatenate([[x, 0, 1, *still] for x in (0.0, 0.0, 1.0, 1.5, 2.0)])
     slope = jax.jacrev(lambda q: find(q).dist)(jnp.asarray(qpos))
@@ -146,8 +138,10 @@ def _outcome(mj_model, dtype):
         lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (mjx.put_model(mj_model), mjx.make_data(mj_model))
     )
 
+    find = finder(model, start)
+
     def outcome(qpos):
-        contact = collide(model, kinematics(model, start.replace(qpos=qpos)))._impl.contact
+        contact = find(qpos)
         return jnp.concatenate([contact.dist[:1], contact.frame[0, 0], contact.pos[0]])
 
     return jax.jit(outcome)

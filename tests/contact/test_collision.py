@@ -1,5 +1,7 @@
 """Contacts against C MuJoCo's and against MJX's."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -8,8 +10,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
-from mjxgrad.bodies import kinematics
 from mjxgrad.contact.collision import collide, slot_geoms
+from tests.contact.test_capsules import TILTED, by_pair_and_depth, finder, loaded, poses
 from tests.scenes import central_difference
 
 # Two boxes that do not meet, over two tilted planes; margins beyond all distances, so that C MuJoCo reports every corner.
@@ -42,26 +44,8 @@ CAN = """
 <mujoco><worldbody><body><freejoint/><geom size=".07" margin="5"/></body>
 <body><freejoint/><geom type="cylinder" size=".1 .15"/></body></worldbody></mujoco>
 """
+two_poses = functools.partial(poses, num_bodies=2, spread=0.1)
 BALL_AND_BOX = CAN.replace('type="cylinder" size=".1 .15"', 'type="box" size=".1 .2 .05"').replace(".07", ".03")
-
-
-def _finder(model):
-    return jax.jit(
-        lambda data: collide(model, kinematics.com_pos(model, kinematics.kinematics(model, data)))._impl.contact
-    )
-
-
-def _poses(seed, num_bodies=2):
-    random = np.random.default_rng(seed)
-    quaternions = random.normal(size=(num_bodies, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return np.concatenate([random.normal(scale=0.1, size=(num_bodies, 3)), quaternions], axis=1).ravel()
-
-
-def _loaded(xml):
-    mj_model = mujoco.MjModel.from_xml_string(xml)
-    model = mjx.put_model(mj_model)
-    return mj_model, mjx.make_data(mj_model), _finder(model), slot_geoms(model, mjx.make_data(mj_model))
 
 
 @pytest.mark.parametrize(
@@ -71,18 +55,13 @@ def _loaded(xml):
 )
 def test_they_touch_where_they_do_in_c(xml, num_contacts, num_places):
     """Pairs, distances, places and normals, in C's order after sorting by pair and depth; from outside and from within."""
-    mj_model, start, find, geoms = _loaded(xml)
+    mj_model, geoms, find = loaded(xml)
     mj_data, places = mujoco.MjData(mj_model), set()
     for seed in range(100):
-        mj_data.qpos[:] = _poses(seed)
+        mj_data.qpos[:] = two_poses(seed)
         mujoco.mj_forward(mj_model, mj_data)
-        contact, theirs = find(start.replace(qpos=jnp.asarray(mj_data.qpos))), mj_data.contact
-        found = [
-            np.column_stack([geoms, contact.dist, contact.pos, contact.frame[:, 0]]),
-            np.column_stack([theirs.geom, theirs.dist, theirs.pos, theirs.frame[:, :3]]),
-        ]
-        assert len(theirs) == num_contacts
-        ours, theirs = (x[np.lexsort((x[:, 2], x[:, 1], x[:, 0]))] for x in found)
+        assert mj_data.ncon == num_contacts
+        ours, theirs = by_pair_and_depth(geoms, find(jnp.asarray(mj_data.qpos)), mj_data.contact)
         # The nearest side of a box that a ball's centre is within 1e-5 of is known to 1e-14 over that.
         np.testing.assert_allclose(ours, theirs, atol=1e-9 if xml is BALL_AND_BOX else 1e-14)
         if xml is not BOXES:
@@ -92,26 +71,33 @@ def test_they_touch_where_they_do_in_c(xml, num_contacts, num_places):
     assert len(places) == num_places or xml is BOXES
 
 
-@pytest.mark.parametrize(("xml", "seeds"), [(BOXES, [7]), (CAN, range(4))], ids=["boxes", "cylinder"])
-def test_contacts_have_the_derivative_of_their_points(xml, seeds):
-    _, start, find, _ = _loaded(xml)
+@pytest.mark.parametrize(
+    ("xml", "at", "close"),
+    [
+        (BOXES, [two_poses(7)], 1e-9),
+        (CAN, [*map(two_poses, range(4))], 1e-7),
+        (TILTED, [*map(poses, range(4))], 1e-6),
+    ],
+    ids=["boxes", "cylinder", "planes, balls and capsules"],
+)
+def test_contacts_have_the_derivative_of_their_points(xml, at, close):
+    """Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5; normals are divided by distances."""
+    *_, find = loaded(xml)
 
     def outcome(qpos):
-        contact = find(start.replace(qpos=qpos))
-        normal = contact.frame[0, 0] if xml is CAN else jnp.zeros(0)
-        return jnp.concatenate([contact.dist, contact.pos.ravel(), normal])
+        contact = find(qpos)
+        return jnp.concatenate([contact.dist, contact.pos.ravel(), contact.frame.ravel()])
 
     both = jax.jit(lambda qpos: (jax.jacrev(outcome)(qpos), central_difference(outcome, qpos, 1e-5)))
-    # Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5; normals are divided by distances.
-    for seed in seeds:
-        np.testing.assert_allclose(*both(jnp.asarray(_poses(seed))), atol=1e-7 if xml is CAN else 1e-9)
+    for qpos in at:
+        np.testing.assert_allclose(*both(jnp.asarray(qpos)), atol=close)
 
 
 def test_on_its_axis_a_ball_on_a_cylinder_has_a_derivative():
     """Upright, centres one above the other: the distance is the height less what is between, whichever way it moves."""
-    _, start, find, _ = _loaded(CAN)
+    *_, find = loaded(CAN)
     upright = jnp.array([0, 0, 0.21, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0], float)
-    slope = jax.jacrev(lambda qpos: find(start.replace(qpos=qpos)).dist[0])(upright)
+    slope = jax.jacrev(lambda qpos: find(qpos).dist[0])(upright)
     np.testing.assert_allclose(slope[:3], [0, 0, 1], atol=1e-14)
     assert np.isfinite(slope).all()
 
@@ -141,7 +127,8 @@ def test_of_many_balls_the_nearest_to_something_else_are_found(kind):
     found = []
     for numbers in ('<numeric name="max_geom_pairs" data="2"/>', ""):
         model = mjx.put_model(mujoco.MjModel.from_xml_string(xml.format(numbers, kind, balls)))
-        contact = _finder(model)(mjx.make_data(model))
+        data = mjx.make_data(model)
+        contact = finder(model, data)(data.qpos)
         is_with_it = np.asarray(contact.geom == 0).any(axis=1)
         found.append(np.column_stack([contact.dist, contact.pos, contact.frame[:, 0]])[is_with_it])
     few, every = found
@@ -151,33 +138,26 @@ def test_of_many_balls_the_nearest_to_something_else_are_found(kind):
     )
 
 
-@pytest.mark.parametrize("kind", ['type="box" size=".1 .2 .05"', 'type="mesh" mesh="block"'])
-def test_contacts_of_two_faces_lie_half_way_between_them_as_in_c(kind):
-    """A block lies 3 mm deep in another that is larger; the four corners, in C's order after sorting."""
-    scene = mg.load_scene(f"""<mujoco><asset><mesh name="block"
-      vertex="-.1 -.2 -.05 .1 -.2 -.05 -.1 .2 -.05 .1 .2 -.05 -.1 -.2 .05 .1 -.2 .05 -.1 .2 .05 .1 .2 .05"/></asset>
-      <worldbody><geom type="box" size=".5 .5 .1"/><body pos=".02 .03 .147"><freejoint/><geom {kind}/></body></worldbody>
-    </mujoco>""")
-    data = mujoco.MjData(scene.mj_model)
-    mujoco.mj_forward(scene.mj_model, data)
-    found = _finder(scene.model)(scene.data)
-    acts = np.asarray(found.dist) < 0
-    ours, theirs = np.asarray(found.pos)[acts].round(9), data.contact.pos.round(9)
-    assert len(ours) == len(theirs) == 4
-    np.testing.assert_allclose(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)], atol=1e-8)
-    np.testing.assert_allclose(np.asarray(found.dist)[acts], data.contact.dist, atol=1e-9)
+_BLOCK = "-.1 -.2 -.05 .1 -.2 -.05 -.1 .2 -.05 .1 .2 -.05 -.1 -.2 .05 .1 -.2 .05 -.1 .2 .05 .1 .2 .05"
+_PRISM = "-.1 -.1 0 .12 -.08 0 0 .1 0 -.1 -.1 .1 .12 -.08 .1 0 .1 .1"
 
 
-def test_a_mesh_that_stands_on_three_corners_has_their_contacts():
-    """A prism, 1 mm deep and a little tilted. MJX takes one of the three corners a second time; it counts once."""
-    scene = mg.load_scene("""<mujoco><asset><mesh name="prism"
-      vertex="-.1 -.1 0 .12 -.08 0 0 .1 0 -.1 -.1 .1 .12 -.08 .1 0 .1 .1"/></asset><worldbody>
-      <geom type="box" size=".5 .5 .1"/><body pos="0 0 .099" euler=".05 .03 10"><freejoint/>
-        <geom type="mesh" mesh="prism"/></body></worldbody></mujoco>""")
+@pytest.mark.parametrize(
+    ("corners", "place", "count", "close"),
+    [
+        (_BLOCK, 'pos=".02 .03 .147"', 4, 1e-8),  # 3 mm deep, half way between its face and the other's
+        # 1 mm deep and a little tilted. MJX takes one of the three corners a second time; it counts once.
+        (_PRISM, 'pos="0 0 .099" euler=".05 .03 10"', 3, 2e-6),
+    ],
+    ids=["block", "prism"],
+)
+def test_a_mesh_that_stands_on_a_box_touches_at_its_corners_as_in_c(corners, place, count, close):
+    scene = mg.load_scene(f"""<mujoco><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>
+      <geom type="box" size=".5 .5 .1"/><body {place}><freejoint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>""")
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
-    found = _finder(scene.model)(scene.data)
-    acts = np.asarray(found.dist) < 0
-    ours, theirs = (np.unique(x.round(6), axis=0) for x in (np.asarray(found.pos)[acts], data.contact.pos))
-    assert acts.sum() == data.ncon == len(theirs) == 3
-    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+    found = finder(scene.model, scene.data)(scene.data.qpos)
+    ours = np.column_stack([found.pos, found.dist])[np.asarray(found.dist) < 0]
+    theirs = np.column_stack([data.contact.pos, data.contact.dist])
+    assert len(ours) == len(theirs) == count
+    np.testing.assert_allclose(*(x[np.lexsort(x[:, :3].round(5).T)] for x in (ours, theirs)), atol=close)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.contact.warnings import largest_stable_step
 from mjxgrad.scene import load_scene
 
 # Every ball touches the floor: mixing, a share of solmix, none at all, priority of either side,
@@ -78,12 +77,6 @@ def test_refsafe_can_be_off(touching):
     np.testing.assert_allclose(free.contact_parameters().stiffness[row], 1e6, rtol=1e-12)
 
 
-def test_pairs_are_all_that_mjx_tests(scene):
-    # 8 balls among each other (28 pairs) and with the floor (8).
-    assert len(scene.pairs) == 36
-    assert len({frozenset((p.geom1, p.geom2)) for p in scene.pairs}) == 36
-
-
 def test_an_unnamed_geom_is_called_by_its_body():
     source = (
         '<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="cart">'
@@ -96,12 +89,6 @@ def test_without_contact_there_are_no_pairs():
     for flag in ("contact", "constraint"):
         source = _balls().replace("/><worldbody>", f'><flag {flag}="disable"/></option><worldbody>', 1)
         assert contact_pairs(mujoco.MjModel.from_xml_string(source)) == ()
-
-
-def test_the_limit_of_runge_kutta_is_that_of_the_textbook():
-    # On the imaginary axis |R(iy)| = 1 at y = 2√2.
-    step = largest_stable_step(0.0, mujoco.mjtIntegrator.mjINT_RK4)
-    np.testing.assert_allclose(step, 2 * np.sqrt(2), rtol=1e-9)
 
 
 def test_a_time_constant_below_two_steps_is_warned_about():

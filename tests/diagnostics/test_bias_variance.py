@@ -154,47 +154,34 @@ def test_everything_is_compiled_once_and_progress_is_told(jumps):
     assert progress == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_several_parameters_take_a_long_run_for_reference():
-    point, stddev = np.array([0.5, -1.2, 0.4]), np.array([0.1, 0.4, 0.2])
-    table = bias_variance(
-        lambda scale: parameter_noise(lambda x: scale * textbook.bumpy(x), jnp.asarray(stddev)),
-        jnp.asarray(point)[None],
-        jax.random.key(2),
-        softness=jnp.array([1.0, 3.0]),
-        num_samples=500,
-        num_reference=20_000,
-    )
-    exact = np.array([1.0, 3.0])[:, None] * textbook.bumpy_gradient(point, stddev)
-    assert table.landscape is None
-    np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
-    np.testing.assert_array_less(np.abs(table.bias), 4 * table.bias_error)
-    norms, norm = table.table(), np.linalg.norm(exact, axis=1)
-    assert (norms["truth_low"][:, 0] < norm).all()
-    assert (norm < norms["truth_high"][:, 0]).all()
-    assert (norms["zeroth_bias_low"] == 0).all()
-
-
 class Hidden(ParameterNoise):
     """A cost that does not tell of its noise what α-order asks for."""
 
     differentiate = Objective.differentiate
 
 
-def test_where_the_noise_is_not_known_the_reference_is_zeroth_order_and_alpha_is_none():
-    point, stddev = jnp.array([0.5, -1.2, 0.4]), jnp.array([0.1, 0.4, 0.2])
+@pytest.mark.parametrize("kind", [ParameterNoise, Hidden])
+def test_several_parameters_take_a_long_run_for_reference_of_zeroth_order_where_the_noise_is_not_known(kind):
+    point, stddev, scales = np.array([0.5, -1.2, 0.4]), np.array([0.1, 0.4, 0.2]), np.array([1.0, 3.0])
     table = bias_variance(
-        lambda scale: Hidden(lambda x: scale * textbook.bumpy(x), stddev, 3),
-        point[None],
+        lambda scale: kind(lambda x: scale * textbook.bumpy(x), jnp.asarray(stddev), 3),
+        jnp.asarray(point)[None],
         jax.random.key(2),
-        softness=jnp.array([1.0, 3.0]),
+        softness=jnp.asarray(scales),
         num_samples=1000,
         num_reference=20_000,
     )
-    exact = np.array([1.0, 3.0])[:, None] * textbook.bumpy_gradient(np.asarray(point), np.asarray(stddev))
-    assert table.alpha_order is None
+    exact = scales[:, None] * textbook.bumpy_gradient(point, stddev)
+    assert table.landscape is None
+    assert (table.alpha_order is None) == (kind is Hidden)
+    assert (str(table).splitlines()[0].split()[-3:] == ["variance:", "first", "zeroth"]) == (kind is Hidden)
     np.testing.assert_array_less(np.abs(table.reference[:, 0] - exact), 4 * table.reference_error[:, 0])
-    np.testing.assert_allclose(table.cost[:, 0], np.array([1.0, 3.0]) * float(textbook.bumpy(point)))
-    assert str(table).splitlines()[0].split()[-3:] == ["variance:", "first", "zeroth"]
+    np.testing.assert_array_less(np.abs(table.bias), 4 * table.bias_error)
+    np.testing.assert_allclose(table.cost[:, 0], scales * float(textbook.bumpy(point)))
+    norms, norm = table.table(), np.linalg.norm(exact, axis=1)
+    assert (norms["truth_low"][:, 0] < norm).all()
+    assert (norm < norms["truth_high"][:, 0]).all()
+    assert (norms["zeroth_bias_low"] == 0).all()
 
 
 def test_the_reference_is_unbiased_and_its_error_on_the_safe_side():

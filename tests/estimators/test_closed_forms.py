@@ -11,7 +11,7 @@ import pytest
 from mjxgrad import estimators
 from mjxgrad.objective import closed_loop, open_loop, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import STDDEV, assert_within_error, first_order, zeroth_order
+from tests.estimators.textbook import CONTROLS, POLICY_PARAMS, STDDEV, assert_within_error, first_order, zeroth_order
 
 N = 40_000
 # On all of the problems below α-order must be as right as the unbiased ones, whichever part it chooses.
@@ -23,9 +23,7 @@ ESTIMATORS = {
     "alpha_order": eqx.filter_jit(estimators.alpha_order),
 }
 RAMP = textbook.ramp(0.03)
-SINGLE = (RAMP, textbook.quadratic_sine, textbook.step, textbook.ball_over_wall)
-POLICY = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
-CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
+SINGLE = (RAMP, textbook.quadratic_sine, textbook.step)
 
 
 class OneOf(eqx.Module):
@@ -59,8 +57,8 @@ def noise_of_each_parameter():
 def a_policy():
     """A linear system under a linear policy: mean and covariance, so the expected cost, by recursion."""
     task = textbook.LinearSystem()
-    objective = closed_loop(task, textbook.linear_policy, 0.3, params=POLICY)
-    at = objective.ravel(POLICY)
+    objective = closed_loop(task, textbook.linear_policy, 0.3, params=POLICY_PARAMS)
+    at = objective.ravel(POLICY_PARAMS)
     return objective, at, jax.jit(jax.grad(lambda p: task.expected_cost(objective.unravel(p), 0.3)))(at)
 
 
@@ -91,23 +89,3 @@ def test_a_step_is_seen_by_all_but_first_order(key, name):
         assert estimate.value == estimate.variance == 0
     else:
         assert_within_error(estimate, textbook.step_gradient(0.07))
-
-
-def test_a_steep_ramp_has_the_variance_of_rare_large_slopes(key):
-    """Of a Bernoulli variable, 2/ν times."""
-    width, point = 0.03, 0.04
-    p = textbook.ramp_probability(point, width)
-    estimate = first_order(noisy(RAMP), jnp.array([point]), key, num_samples=N)
-    # Var of a Bernoulli's sample variance: p(1-p)(1-2p)²/N to leading order.
-    error = (2 / width) ** 2 * np.sqrt(p * (1 - p) * (1 - 2 * p) ** 2 / N)
-    assert abs(estimate.variance - (2 / width) ** 2 * p * (1 - p)) < 4 * error
-
-
-@pytest.mark.parametrize("name", ["first_order", "zeroth_order", "control_variate", "alpha_order"])
-def test_the_throw_that_clears_the_wall_is_seen_by_all_but_first_order(key, name):
-    """First order has the wrong sign: it converges to E f', without the jumps."""
-    smooth, truth = textbook.ball_over_wall_gradients(0.8)
-    assert smooth > 0 > truth
-    objective = noisy(textbook.ball_over_wall)
-    estimate = ESTIMATORS[name](objective, jnp.array([0.8]), key, num_samples=N)
-    assert_within_error(estimate, smooth if name == "first_order" else truth)

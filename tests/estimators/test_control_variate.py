@@ -13,12 +13,10 @@ from mjxgrad import estimators
 from mjxgrad.estimators import Diagnosis, rules
 from mjxgrad.objective import closed_loop, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import repeat
+from tests.estimators.textbook import POINT, STDDEVS, repeat
 from tests.objective.test_objective import Laplace
 
 control_variate = eqx.filter_jit(estimators.control_variate)
-STDDEVS = jnp.array([0.1, 0.2, 0.3])
-POINT = jnp.array([0.3, 0.1, -0.5])
 
 
 def jumpy(x):

@@ -62,19 +62,6 @@ def test_pairs_whose_scores_do_not_cancel_know_their_error():
     np.testing.assert_array_less(np.abs(np.asarray(estimates.value).mean(axis=0) - exact), 4 * error)
 
 
-def test_the_leave_one_out_baseline_halves_the_error_at_a_jump():
-    """0.195 without it, 0.0975 with it, at N = 1000 and θ = 0."""
-    objective = parameter_noise(textbook.step, textbook.STDDEV)
-
-    def error(baseline):
-        estimate = zeroth_order(objective, jnp.array([0.0]), jax.random.key(6), num_samples=400_000, baseline=baseline)
-        return float(estimate.standard_error[0]) * np.sqrt(400)
-
-    # Without: Var(1[w>0]·w/σ²) = (1/2 - 1/2π)/σ². With: Var(±½·|w|... ) = (1/4 - 1/2π)/σ², here over N = 1000.
-    assert error("none") == pytest.approx(np.sqrt((1 / 2 - 1 / (2 * np.pi)) / 0.01 / 1000), rel=0.01)
-    assert error("leave_one_out") == pytest.approx(np.sqrt((1 / 4 - 1 / (2 * np.pi)) / 0.01 / 1000), rel=0.01)
-
-
 def test_the_mean_cost_knows_its_error():
     times, point = 4000, 0.3
     objective = parameter_noise(textbook.quadratic_sine, textbook.STDDEV)

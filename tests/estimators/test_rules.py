@@ -88,14 +88,3 @@ def test_the_empirical_radius_fails_at_most_as_often_as_it_says(dim, failure_pro
     assert failures < failure_probability + 4 * error
     if dim == 1:
         assert failures > failure_probability - 4 * error
-
-
-def test_bernsteins_bound_fails_at_most_as_often_as_it_says():
-    """Bounded and skewed: one in ten is 1, the others 0, so that L = 0.9 bounds a deviation."""
-    rng, times, count = np.random.default_rng(0), 20_000, 40
-    samples = (rng.random((times, count)) < 0.1).astype(float)
-    rule = rules.BiasConstrained(1.0, bound=0.9, failure_probability=0.2)
-    facts = evidence(dim=1.0, count=count)
-    # The inequality is for the true variance.
-    error = rule.zeroth_error(Evidence(**(vars(facts) | {"zeroth_variance": jnp.array(0.09)})))
-    assert (np.abs(samples.mean(axis=1) - 0.1) > float(error)).mean() <= 0.2

@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
-from scipy.integrate import quad
 from scipy.stats import norm
 
 from mjxgrad import estimators
@@ -14,6 +13,10 @@ from mjxgrad.objective.task import Outcome
 from mjxgrad.tasks import Task
 
 STDDEV = 0.1
+# Of `bumpy`, and of the linear system.
+POINT, STDDEVS = jnp.array([0.3, 0.1, -0.5]), jnp.array([0.1, 0.2, 0.3])
+POLICY_PARAMS = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
+CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
 
 # Compiled as a whole: one compilation each in place of some thirty small ones.
 first_order = eqx.filter_jit(estimators.first_order)
@@ -49,40 +52,6 @@ def quadratic_sine(x: Float[Array, " 1"]) -> Float[Array, ""]:
 def quadratic_sine_gradient(point: float) -> float:
     """E x² = θ² + σ²; E sin(ωx) = exp(-ω²σ²/2) sin(ωθ)."""
     return 2 * point + 0.1 * 20 * np.exp(-(20**2) * STDDEV**2 / 2) * np.cos(20 * point)
-
-
-SPEED, GRAVITY, WALL, HEIGHT = 1.0, 9.81, 0.06, 0.02
-
-
-def ball_over_wall(angle: Float[Array, " 1"]) -> Float[Array, ""]:
-    """Minus the squared range of a point thrown at an angle; it falls straight down if a wall stops it."""
-    reach = SPEED**2 * jnp.sin(2 * angle[0]) / GRAVITY
-    height_at_wall = WALL * jnp.tan(angle[0]) - GRAVITY * WALL**2 / (2 * SPEED**2 * jnp.cos(angle[0]) ** 2)
-    is_blocked = (reach > WALL) & (height_at_wall < HEIGHT)
-    return -(jnp.where(is_blocked, WALL, reach) ** 2)
-
-
-def ball_over_wall_gradients(point: float) -> tuple[float, float]:
-    """What first order converges to, E f', and the truth, which adds each jump times the density there."""
-    # Height at the wall equals the wall's at two angles: a quadratic in tan.
-    drop = GRAVITY * WALL**2 / (2 * SPEED**2)
-    lower, upper = np.arctan(np.sort(np.roots([-drop, WALL, -drop - HEIGHT])))
-
-    def density(angle: float) -> float:
-        return norm.pdf((angle - point) / STDDEV) / STDDEV
-
-    def cost(angle: float) -> float:
-        return -((SPEED**2 * np.sin(2 * angle) / GRAVITY) ** 2)
-
-    def slope(angle: float) -> float:
-        return -2 * np.sin(2 * angle) * 2 * np.cos(2 * angle) * SPEED**4 / GRAVITY**2
-
-    short = np.arcsin(WALL * GRAVITY / SPEED**2) / 2
-    pieces = [(point - 9 * STDDEV, short), (lower, upper), (np.pi / 2 - short, point + 9 * STDDEV)]
-    smooth = sum(quad(lambda x: slope(x) * density(x), a, b, epsabs=1e-12)[0] for a, b in pieces if a < b)
-    jump_up = (cost(lower) + WALL**2) * density(lower)
-    jump_down = (-(WALL**2) - cost(upper)) * density(upper)
-    return smooth, smooth + jump_up + jump_down
 
 
 def bumpy(x: Float[Array, " 3"]) -> Float[Array, ""]:

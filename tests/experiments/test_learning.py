@@ -66,20 +66,12 @@ def test_a_reward_that_falls_again_is_not_the_soonest():
     assert [one.method for one in Outcome(QUICK, courses, None).soonest] == ["discrete"]
 
 
-COMMAND = [
-    "run",
-    "learn_cartpole",
-    'size="quick"',
-    "sizes.num_updates=2",
-    "sizes.num_episodes=1",
-    'methods=["discrete"]',
-    "precision=float64",
-]
-
-
 @pytest.mark.slow
 def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
-    assert main([*COMMAND, "video.width=64", "--output", str(tmp_path)]) == 0
+    sizes = (
+        'size="quick" sizes.num_updates=2 sizes.num_episodes=1 video.width=64 methods=["discrete"] precision=float64'
+    )
+    assert main(["run", "learn_cartpole", *sizes.split(), "--output", str(tmp_path)]) == 0
     folder = tmp_path / "learn_cartpole"
     with (folder / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -11,6 +11,7 @@ from mjxgrad.objective import parameter_noise
 CENTRE = jnp.array([1.0, -2.0])
 CURVATURE = jnp.array([1.0, 3.0])
 STDDEV = 0.1
+START = jnp.array([0.0, 0.5])
 
 
 def bowl(x):

@@ -1,15 +1,14 @@
 """An interrupted run loses nothing, and a file that is not its own is refused."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
 import mjxgrad as mg
 from tests.loop import problems
+from tests.loop.problems import START
 
-START = jnp.array([0.0, 0.5])
 KEY = jax.random.key(2)
 
 

@@ -8,9 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from tests.loop import problems
-from tests.loop.problems import CENTRE, CURVATURE, made_up
-
-START = jnp.array([0.0, 0.5])
+from tests.loop.problems import CENTRE, CURVATURE, START, made_up
 
 
 def loop(transformation, num_steps):

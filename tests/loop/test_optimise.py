@@ -14,9 +14,8 @@ from IPython.lib.pretty import pretty
 import mjxgrad as mg
 from mjxgrad import estimators
 from tests.loop import problems
-from tests.loop.problems import CENTRE, CURVATURE, STDDEV, made_up
+from tests.loop.problems import CENTRE, CURVATURE, START, STDDEV, made_up
 
-START = jnp.array([0.0, 0.5])
 SGD = optax.sgd(0.1)
 
 
@@ -50,11 +49,6 @@ def test_every_rollout_of_the_method_is_counted_and_none_of_the_measurement(zero
     assert zeroth_order_run.num_rollouts == 16 * 250
     assert zeroth_order_run.num_gradient_rollouts == 0
     assert run(jax.random.key(0), problems.first_order).num_gradient_rollouts == 4 * 30
-
-
-def test_steps_that_fill_up_the_last_segment_do_nothing(zeroth_order_run):
-    assert zeroth_order_run.num_steps == 250
-    assert zeroth_order_run.history.cost.shape == (250,)
 
 
 def test_the_noise_free_cost_is_measured_when_it_is_due(zeroth_order_run):

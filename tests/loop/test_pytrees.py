@@ -9,6 +9,7 @@ import pytest
 
 import mjxgrad as mg
 from tests.loop import problems
+from tests.loop.problems import START
 
 
 class Gains(eqx.Module):
@@ -28,7 +29,6 @@ FORMS = {
         lambda form: jnp.append(form.stiff, form.loose) if form.activation is jnp.tanh and form.count == 3 else None,
     ),
 }
-START = jnp.array([0.0, 0.5])
 SETTINGS = {"estimator": problems.first_order, "optimiser": optax.adam(0.05)}
 
 

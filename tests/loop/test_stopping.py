@@ -11,19 +11,16 @@ import pytest
 import mjxgrad as mg
 from tests.estimators.test_nothing_felt import dead_zone
 from tests.loop import problems
-from tests.loop.problems import made_up
-
-START = jnp.array([0.0, 0.5])
-
-
-def run(key, estimator=problems.exact, **settings):
-    settings = {"optimiser": optax.sgd(0.1), "num_steps": 60, **settings}
-    return mg.optimise(problems.objective, START, key, estimator=estimator, **settings)
+from tests.loop.problems import START, made_up
 
 
 def test_a_log_is_told_the_last_step_of_every_segment(key):
     told = []
-    result = run(key, log=lambda step, metrics: told.append((step, metrics)))
+    log, settings = (
+        lambda *step_and_metrics: told.append(step_and_metrics),
+        {"optimiser": optax.sgd(0.1), "num_steps": 60},
+    )
+    result = mg.optimise(problems.objective, START, key, estimator=problems.exact, log=log, **settings)
     assert [step for step, _ in told] == list(range(3, 61, 3))
     assert mg.Stopped[result.stopped] == "all steps were done"
     for step, metrics in told:

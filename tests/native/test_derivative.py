@@ -147,15 +147,14 @@ def test_both_engines_and_both_modes_agree(pushed):
 
 
 def test_batches_are_those_of_single_calls(pushed):
-    """Starts and parameters mapped over at once, two axes deep."""
+    """Starts and parameters mapped over at once, two axes deep; with their outcomes."""
     at, end = pushed
     speeds, stiffness = at["qvel"] * jnp.array([[1.0], [0.5]]), jnp.array([400.0, 900.0, 2500.0])
-    gradient = jax.grad(lambda v, k: end(at | {"qvel": v, "stiffness": k}), argnums=(0, 1))
-    found = jax.jit(jax.vmap(jax.vmap(gradient, (None, 0)), (0, None)))(speeds, stiffness)
-    single = [[gradient(v, k) for k in stiffness] for v in speeds]
-    for part in range(2):
-        expected = np.array([[one[part] for one in row] for row in single])
-        np.testing.assert_allclose(found[part], expected, rtol=1e-9, atol=1e-12)
+    both = jax.value_and_grad(lambda v, k: end(at | {"qvel": v, "stiffness": k}), argnums=(0, 1))
+    found = jax.jit(jax.vmap(jax.vmap(both, (None, 0)), (0, None)))(speeds, stiffness)
+    single = [both(v, k) for v in speeds for k in stiffness]
+    expected = jax.tree.map(lambda *x: np.reshape(x, (2, 3, *x[0].shape)), *single)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12), found, expected)
 
 
 def test_a_policy_is_differentiated_through_the_loop(pushed):

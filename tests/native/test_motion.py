@@ -1,4 +1,4 @@
-"""C MuJoCo behind `rollout`: the same motion, mapped over starts, controls and softness; what it cannot do is refused."""
+"""C MuJoCo behind `rollout`: the same motion, mapped over starts and controls; what it cannot do is refused."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -37,27 +37,6 @@ def test_the_motion_is_that_of_our_own_step(scene):
     for name in ("ctrl", "diverged", "first_bad_step"):
         np.testing.assert_array_equal(getattr(theirs, name), getattr(ours, name))
     np.testing.assert_allclose(theirs.final.time, ours.final.time, rtol=1e-12)
-
-
-def test_starts_and_softness_may_be_mapped_over_at_once():
-    """A ball that bounces, against one call after another."""
-    scene = mg.load_scene(
-        """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .11"><freejoint/>
-        <geom size=".1"/></body></worldbody></mujoco>"""
-    )
-    stiffness, speeds = jnp.array([1e3, 1e4]), jnp.array([0.0, -1.0, -2.0])
-
-    def last(stiffness, speed):
-        soft = scene.with_softness(mg.Softness(stiffness=stiffness, damping_ratio=1.0))
-        qvel = jnp.zeros(scene.model.nv).at[2].set(speed)
-        return mg.rollout(soft, mg.initial_state(soft, qvel=qvel), horizon=HORIZON, contact=mg.Discrete("mujoco")).qpos[
-            -1
-        ]
-
-    found = jax.jit(jax.vmap(jax.vmap(last, (None, 0)), (0, None)))(stiffness, speeds)
-    expected = np.array([[last(k, v) for v in speeds] for k in stiffness])
-    np.testing.assert_array_equal(found, expected)
-    assert np.abs(found[0] - found[1]).max() > 1e-6
 
 
 def test_a_rollout_that_diverges_stays_at_its_last_good_state(scene):

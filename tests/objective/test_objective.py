@@ -8,11 +8,9 @@ import pytest
 
 from mjxgrad.objective import Objective, closed_loop, open_loop, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import RandomStart
+from tests.estimators.textbook import CONTROLS, POLICY_PARAMS, RandomStart
 
 STDDEV = 0.3
-CONTROLS = jnp.array([[0.4], [-0.7], [0.2], [0.9]])
-POLICY_PARAMS = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
 
 
 @pytest.fixture

@@ -55,12 +55,3 @@ def test_a_network_closes_a_loop_and_is_differentiated_by_its_noise(key):
     pulled_back, gradient = both(flat)
     assert np.abs(gradient).min() > 1e-6
     np.testing.assert_allclose(pulled_back, gradient, rtol=1e-9)
-
-
-def test_a_linear_policy_costs_what_the_recursion_says():
-    """The cost without noise, in closed form."""
-    task, (policy, _) = textbook.LinearSystem(), mg.linear_policy(2, 1)
-    params = affine([[-0.3, 0.2]], [0.25])
-    objective = mg.closed_loop(task, policy, 0.3, params=params)
-    expected = task.expected_cost({"gain": params.weight, "offset": params.bias}, 0.0)
-    np.testing.assert_allclose(objective.value(objective.ravel(params), objective.zero_noise()), expected, rtol=1e-12)

@@ -67,25 +67,6 @@ def mean_step(system, state, control, key, **noise):
     return Sampled(**noise).step(system, state, control, key)
 
 
-def test_a_linear_step_is_found_without_error_by_all_three(key):
-    system = FunctionSystem(affine, 2, 1)
-    at = (system, jnp.array([0.4, -1.0]), jnp.array([0.2]))
-    noise = {"stddev_state": 0.3, "stddev_control": 0.2}
-
-    @eqx.filter_jit
-    def found():
-        first = first_order(*at, key, num_samples=3, **noise)
-        zeroth = zeroth_order(*at, key, num_samples=6, **noise)
-        return (analytic(*at), first, zeroth), mean_step(*at, key, num_samples=1, **noise)
-
-    models, mean = found()
-    for model in models:
-        np.testing.assert_allclose(model.A, A, atol=1e-12)
-        np.testing.assert_allclose(model.B, B, atol=1e-12)
-        np.testing.assert_allclose(model.c, affine(*at[1:]), atol=1e-12)
-    np.testing.assert_allclose(mean, affine(*at[1:]), atol=1e-12)
-
-
 def exact_wall():
     """E max(0, −x − w) = σ [φ(z) − z Φ(−z)], z = x/σ, and its derivative −Φ(−z)."""
     z = POINT / STDDEV

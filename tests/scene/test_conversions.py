@@ -10,31 +10,8 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.collision import collide
 from mjxgrad.scene import SceneWarning, load_scene
 from mjxgrad.stepping import forward
+from tests.scene.test_refusals import BALL, PENDULUM, fill
 
-PENDULUM = """
-<mujoco>
-  <option timestep="0.005" tolerance="1e-12" {option}>{flag}</option>
-  <worldbody>
-    <body name="b" pos="0 0 0.5" gravcomp="0.3">
-      <joint name="j" axis="0 1 0" stiffness="5" damping="1" {joint}/>
-      <geom name="g" type="capsule" size="0.05" fromto="0 0 0 0.3 0.1 0"/>
-    </body>
-  </worldbody>
-  {rest}
-</mujoco>
-"""
-BALL = """
-<mujoco>
-  <option timestep="0.005" tolerance="1e-12" {option}>{flag}</option>
-  <worldbody>
-    <geom name="floor" type="plane" size="1 1 0.1" friction="{friction}" condim="{condim}"/>
-    <body name="b" pos="0 0 0.095">
-      <freejoint/><geom name="g" size="0.1" friction="{friction}" condim="{condim}"/>
-    </body>
-  </worldbody>
-  {rest}
-</mujoco>
-"""
 BOX = """
 <mujoco>
   <option timestep="0.005" {option}/>
@@ -48,12 +25,11 @@ CUBE = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z i
 
 
 def _pendulum(**parts):
-    return PENDULUM.format(**(dict.fromkeys(("option", "flag", "joint", "rest"), "") | parts))
+    return fill(PENDULUM, joint='stiffness="5" damping="1"', **parts)
 
 
 def _ball(friction="1", condim=3, **parts):
-    blank = dict.fromkeys(("option", "flag", "rest"), "")
-    return BALL.format(friction=friction, condim=condim, **(blank | parts))
+    return fill(BALL, asset=f'<default><geom friction="{friction}" condim="{condim}"/></default>', **parts)
 
 
 # Source, and the setting that the conversion names.
@@ -141,7 +117,7 @@ def test_a_solve_that_would_end_short_is_let_to_its_end():
 
 
 def test_few_iterations_are_no_matter_where_nothing_is_solved():
-    scene = load_scene(PENDULUM.format(option="iterations='1'", flag="", joint="", rest=""))  # a warning fails the test
+    scene = load_scene(_pendulum(option="iterations='1'"))  # a warning fails the test
     assert scene.mj_model.opt.iterations == 1
 
 

@@ -16,7 +16,7 @@ PENDULUM = """
   {asset}
   <worldbody>
     <site name="top" pos="0 0 1"/>
-    <body name="b" pos="0 0 0.5">
+    <body name="b" pos="0 0 0.5" gravcomp="0.3">
       <joint name="j" axis="0 1 0" {joint}/>
       <geom name="g" type="capsule" size="0.05" fromto="0 0 0 0.3 0.1 0" {geom}/>
       <site name="s" pos="0.3 0 0"/>
@@ -41,7 +41,7 @@ FIXED_TENDON = "<tendon><fixed name='t' {}><joint joint='j' coef='1'/></fixed></
 TETRAHEDRON = "<asset><mesh name='m' vertex='0 0 0 .1 0 0 0 .1 0 0 0 .1'/></asset>"
 
 
-def _fill(template, **parts):
+def fill(template, **parts):
     blank = dict.fromkeys(("option", "flag", "asset", "joint", "geom", "rest", "body"), "")
     return template.format(**(blank | parts))
 
@@ -52,76 +52,76 @@ def _actuator(attributes, kind="motor", target="joint='j'"):
 
 # Source, what the message must name, and its remedy.
 REFUSED = {
-    "implicit": (_fill(PENDULUM, option="integrator='implicit'"), "integrator='implicit'", "RK4"),
-    "discrete": (_fill(PENDULUM, option="integrator='discrete'"), "integrator='discrete'", "RK4"),
-    "override": (_fill(BALL, flag="<flag override='enable'/>"), "<flag override", "o_solref"),
-    "diagexact": (_fill(BALL, flag="<flag diagexact='enable'/>"), "<flag diagexact", "remove"),
-    "noslip": (_fill(BALL, option="noslip_iterations='9'"), "noslip_iterations=9", "impratio"),
+    "implicit": (fill(PENDULUM, option="integrator='implicit'"), "integrator='implicit'", "RK4"),
+    "discrete": (fill(PENDULUM, option="integrator='discrete'"), "integrator='discrete'", "RK4"),
+    "override": (fill(BALL, flag="<flag override='enable'/>"), "<flag override", "o_solref"),
+    "diagexact": (fill(BALL, flag="<flag diagexact='enable'/>"), "<flag diagexact", "remove"),
+    "noslip": (fill(BALL, option="noslip_iterations='9'"), "noslip_iterations=9", "impratio"),
     "no springs": (
-        _fill(PENDULUM, flag="<flag spring='disable'/>", joint="stiffness='5' damping='1'"), "spring='disable'", "zero"),
+        fill(PENDULUM, flag="<flag spring='disable'/>", joint="stiffness='5' damping='1'"), "spring='disable'", "zero"),
     "no dampers": (
-        _fill(PENDULUM, flag="<flag damper='disable'/>", joint="stiffness='5' damping='1'"), "damper='disable'", "zero"),
-    "contact without width": (_fill(BALL, geom="solimp='.1 .95 0'"), "geom_solimp of geom 'g'", "width"),
+        fill(PENDULUM, flag="<flag damper='disable'/>", joint="stiffness='5' damping='1'"), "damper='disable'", "zero"),
+    "contact without width": (fill(BALL, geom="solimp='.1 .95 0'"), "geom_solimp of geom 'g'", "width"),
     "limit without width": (
-        _fill(PENDULUM, joint="limited='true' range='-5 -1' solimplimit='.2 .9 0'"), "jnt_solimp of joint 'j'", "width"),
-    "joint stiffness polynomial": (_fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
-    "joint damping polynomial": (_fill(PENDULUM, joint="damping='1 2 3'"), "joint 'j'", "linear coefficient"),
+        fill(PENDULUM, joint="limited='true' range='-5 -1' solimplimit='.2 .9 0'"), "jnt_solimp of joint 'j'", "width"),
+    "joint stiffness polynomial": (fill(PENDULUM, joint="stiffness='1 2 3'"), "joint 'j'", "linear coefficient"),
+    "joint damping polynomial": (fill(PENDULUM, joint="damping='1 2 3'"), "joint 'j'", "linear coefficient"),
     "tendon stiffness polynomial": (
-        _fill(PENDULUM, rest=FIXED_TENDON.format("stiffness='1 2 3'")), "tendon 't'", "linear"),
-    "tendon damping polynomial": (_fill(PENDULUM, rest=FIXED_TENDON.format("damping='1 2 3'")), "tendon 't'", "linear"),
-    "actuator damping polynomial": (_fill(PENDULUM, rest=_actuator("damping='0.3 0.2 0.1'")), "actuator 'a'", "linear"),
-    "actuator armature": (_fill(PENDULUM, rest=_actuator("gear='2' armature='0.5'")), "actuator 'a'", "gear²"),
-    "actuator damping": (_fill(PENDULUM, rest=_actuator("gear='2' damping='0.3'")), "actuator 'a'", "gear²"),
-    "surface velocity": (_fill(BALL, geom="surfacevel='1 0 0 0 0 0'"), "geom 'g'", "joint"),
-    "adhesion of a geom": (_fill(BALL, geom="adhesion='5'"), "geom 'g'", "remove"),
+        fill(PENDULUM, rest=FIXED_TENDON.format("stiffness='1 2 3'")), "tendon 't'", "linear"),
+    "tendon damping polynomial": (fill(PENDULUM, rest=FIXED_TENDON.format("damping='1 2 3'")), "tendon 't'", "linear"),
+    "actuator damping polynomial": (fill(PENDULUM, rest=_actuator("damping='0.3 0.2 0.1'")), "actuator 'a'", "linear"),
+    "actuator armature": (fill(PENDULUM, rest=_actuator("gear='2' armature='0.5'")), "actuator 'a'", "gear²"),
+    "actuator damping": (fill(PENDULUM, rest=_actuator("gear='2' damping='0.3'")), "actuator 'a'", "gear²"),
+    "surface velocity": (fill(BALL, geom="surfacevel='1 0 0 0 0 0'"), "geom 'g'", "joint"),
+    "adhesion of a geom": (fill(BALL, geom="adhesion='5'"), "geom 'g'", "remove"),
     "adhesion of a pair": (
-        _fill(BALL, rest="<contact><pair name='p' geom1='g' geom2='floor' adhesion='3'/>"
+        fill(BALL, rest="<contact><pair name='p' geom1='g' geom2='floor' adhesion='3'/>"
               "</contact>"),
         "pair 'p'", "remove"),
     "ellipsoid fluid": (
-        _fill(PENDULUM, option="density='100'", geom="fluidshape='ellipsoid'"), "geom 'g'",
+        fill(PENDULUM, option="density='100'", geom="fluidshape='ellipsoid'"), "geom 'g'",
         "fluidshape='none'"),
     "fluid and implicitfast": (
-        _fill(PENDULUM, option="density='100' integrator='implicitfast'"), "density=100", "Euler"),
+        fill(PENDULUM, option="density='100' integrator='implicitfast'"), "density=100", "Euler"),
     "slider crank": (
-        _fill(PENDULUM,
+        fill(PENDULUM,
               rest=_actuator("cranksite='s' slidersite='top' cranklength='2'", target="")),
         "actuator 'a' (slidercrank)", "joint, tendon or site"),
     "adhesion actuator": (
-        _fill(BALL, rest=_actuator("body='b' ctrlrange='0 1'", "adhesion", "")),
+        fill(BALL, rest=_actuator("body='b' ctrlrange='0 1'", "adhesion", "")),
         "actuator 'a' (body)", "joint, tendon or site"),
     "user dynamics": (
-        _fill(PENDULUM, rest=_actuator("dyntype='user' actdim='1'", "general")),
+        fill(PENDULUM, rest=_actuator("dyntype='user' actdim='1'", "general")),
         "actuator 'a' (user)", "filterexact"),
-    "user gain": (_fill(PENDULUM, rest=_actuator("gaintype='user'", "general")), "actuator 'a' (user)", "affine"),
-    "user bias": (_fill(PENDULUM, rest=_actuator("biastype='user'", "general")), "actuator 'a' (user)", "affine"),
+    "user gain": (fill(PENDULUM, rest=_actuator("gaintype='user'", "general")), "actuator 'a' (user)", "affine"),
+    "user bias": (fill(PENDULUM, rest=_actuator("biastype='user'", "general")), "actuator 'a' (user)", "affine"),
     "disabled actuator group": (
-        _fill(PENDULUM, option="actuatorgroupdisable='1'", rest=_actuator("group='1'")),
+        fill(PENDULUM, option="actuatorgroupdisable='1'", rest=_actuator("group='1'")),
         "actuator 'a'", "actuatorgroupdisable"),
     "early activation": (
-        _fill(PENDULUM,
+        fill(PENDULUM,
               rest=_actuator("dyntype='filter' dynprm='0.1' actearly='true'", "general")),
         "actuator 'a'", "actearly"),
-    "delay": (_fill(PENDULUM, rest=_actuator("delay='0.02' nsample='5'")), "actuator 'a'", "nsample"),
-    "mixed solref": (_fill(BALL, geom="solref='0.02 -5'"), "0.02 -5 in geom_solref of geom 'g'", "positive"),
+    "delay": (fill(PENDULUM, rest=_actuator("delay='0.02' nsample='5'")), "actuator 'a'", "nsample"),
+    "mixed solref": (fill(BALL, geom="solref='0.02 -5'"), "0.02 -5 in geom_solref of geom 'g'", "positive"),
     "mixed solref of an equality": (
-        _fill(PENDULUM, rest="<equality><joint name='e' joint1='j' solref='0.02 -5'/></equality>"),
+        fill(PENDULUM, rest="<equality><joint name='e' joint1='j' solref='0.02 -5'/></equality>"),
         "0.02 -5 in eq_solref of equality 'e'", "positive"),
-    "limit at both ends": (_fill(PENDULUM, joint="range='-5 5' limited='true' margin='0.1'"), "joint 'j'", "half"),
+    "limit at both ends": (fill(PENDULUM, joint="range='-5 5' limited='true' margin='0.1'"), "joint 'j'", "half"),
     "tendon limit at both ends": (
-        _fill(PENDULUM, rest=FIXED_TENDON.format("range='-.1 .1' limited='true' margin='.2'")),
+        fill(PENDULUM, rest=FIXED_TENDON.format("range='-.1 .1' limited='true' margin='.2'")),
         "tendon 't'", "half"),
     "cylinder with box": (
-        _fill(BALL, geom="contype='0' conaffinity='0'",
+        fill(BALL, geom="contype='0' conaffinity='0'",
               body="<body pos='0 0 1'><freejoint/><geom name='can' type='cylinder' "
               "size='.1 .1'/></body><geom name='wall' type='box' size='.1 .1 .1'/>"),
         "'can' (cylinder) with 'wall' (box)", "<exclude>"),
     "mesh with margin": (
-        _fill(BALL, asset=TETRAHEDRON, body="<body pos='0 0 1'><freejoint/><geom name='stone' "
+        fill(BALL, asset=TETRAHEDRON, body="<body pos='0 0 1'><freejoint/><geom name='stone' "
               "type='mesh' mesh='m' margin='.01'/></body>"),
         "'floor' (plane) with 'stone' (mesh)", "margin='0'"),
     "flex": (
-        _fill(BALL, body="<body name='rag' pos='0 0 2'><flexcomp name='cloth' type='grid' "
+        fill(BALL, body="<body name='rag' pos='0 0 2'><flexcomp name='cloth' type='grid' "
               "count='2 2 1' spacing='.1 .1 .1' dim='2' mass='1'/></body>"),
         "flex 'cloth'", "rigid"),
 }  # fmt: skip
@@ -196,8 +196,8 @@ def test_excluded_pairs_and_unused_settings_are_no_obstacle():
     disabled = source.replace("></option>", "><flag contact='disable'/></option>")
     assert load_scene(disabled).pairs == ()
     # An ellipsoid fluid shape without fluid, a group without actuators.
-    load_scene(_fill(PENDULUM, geom="fluidshape='ellipsoid'"))
-    load_scene(_fill(PENDULUM, option="actuatorgroupdisable='2'", rest=_actuator("group='1'")))
+    load_scene(fill(PENDULUM, geom="fluidshape='ellipsoid'"))
+    load_scene(fill(PENDULUM, option="actuatorgroupdisable='2'", rest=_actuator("group='1'")))
 
 
 def _balls(count):

@@ -108,14 +108,9 @@ def test_names_in_another_encoding_are_refused(tmp_path):
 @pytest.mark.filterwarnings("error")
 def test_numbers_beyond_single_precision_are_refused_there():
     heavy = "<mujoco><worldbody><body><freejoint/><geom size='.1' mass='1e300'/></body></worldbody></mujoco>"
-    jax.config.update("jax_enable_x64", False)
-    try:
-        with pytest.raises(
-            SceneError, match=r"numbers up to 3e\+38 in single precision, got a larger one; set jax_enable_x64"
-        ):
-            load_scene(heavy)
-    finally:
-        jax.config.update("jax_enable_x64", True)
+    said = r"numbers up to 3e\+38 in single precision, got a larger one; set jax_enable_x64"
+    with jax.enable_x64(False), pytest.raises(SceneError, match=said):
+        load_scene(heavy)
     assert load_scene(heavy).mj_model.body_mass[1] == 1e300
 
 

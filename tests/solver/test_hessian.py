@@ -71,11 +71,3 @@ def test_one_kernel_mends_what_the_operations_mend():
     assert np.isfinite(expected).all()
     # A condition of 1e4 in single precision.
     np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3)
-
-
-def test_the_matrix_is_that_of_all_rows():
-    """J formed row by row, edges of pyramids included."""
-    layout, (mass, jacobian, row_hessian, _) = _problem(_SIMPLE + _PYRAMIDS)
-    rows = jnp.stack([jacobian.matvec(jnp.broadcast_to(unit[:, None], (_NV, _BATCH))) for unit in jnp.eye(_NV)], axis=1)
-    expected = mass + jnp.einsum("rib,rb,rjb->ijb", rows, row_hessian.simple, rows)
-    np.testing.assert_allclose(jacobian.gram(mass, layout, row_hessian), expected, rtol=1e-12)

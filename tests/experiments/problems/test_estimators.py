@@ -15,22 +15,11 @@ from mjxgrad.estimators import Reason
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.test_rules import assert_decides, evidence
-from tests.estimators.textbook import assert_within_error
+from tests.estimators.textbook import POINT, POLICY_PARAMS, STDDEVS, assert_within_error
 
-POLICY = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.25])}
 CONTROLS = jnp.array([0.4, -0.7, 0.2, 0.9])
 reinforce = eqx.filter_jit(estimators.reinforce)
 least_squares = eqx.filter_jit(estimators.least_squares)
-STDDEVS = jnp.array([0.1, 0.2, 0.3])
-POINT = jnp.array([0.3, 0.1, -0.5])
-
-
-def test_a_linear_cost_is_found_exactly(key):
-    slope = jnp.array([1.0, -2.0, 0.5])
-    estimate = least_squares(parameter_noise(lambda x: 7 + slope @ x, STDDEVS), POINT, key, num_samples=6)
-    np.testing.assert_allclose(estimate.value, slope, rtol=1e-10)
-    np.testing.assert_array_less(estimate.standard_error, 1e-10)
-    assert estimate.num_gradient_rollouts == 0
 
 
 def test_it_is_numpys_fit_to_the_same_samples_chunks_and_missing_ones_included(key):
@@ -43,6 +32,7 @@ def test_it_is_numpys_fit_to_the_same_samples_chunks_and_missing_ones_included(k
     costs = np.array([cost(POINT + w) for w in noise])
     kept = np.isfinite(costs)
     assert estimate.num_finite == kept.sum() < 50
+    assert estimate.num_gradient_rollouts == 0
     design = np.column_stack([np.ones(kept.sum()), noise[kept]])
     fit, *_ = np.linalg.lstsq(design, costs[kept])
     np.testing.assert_allclose(estimate.value, fit[1:], rtol=1e-9)
@@ -64,18 +54,18 @@ def test_too_few_samples_and_noise_that_is_not_on_the_parameters_are_refused(key
         estimators.least_squares(parameter_noise(textbook.bumpy, STDDEVS), POINT, key, num_samples=4)
     objective = closed_loop()
     with pytest.raises(ValueError, match="noise on the parameters"):
-        estimators.least_squares(objective, objective.ravel(POLICY), key, num_samples=40)
+        estimators.least_squares(objective, objective.ravel(POLICY_PARAMS), key, num_samples=40)
 
 
 def closed_loop(stddev=0.3):
-    return mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, stddev, params=POLICY)
+    return mg.closed_loop(textbook.LinearSystem(), textbook.linear_policy, stddev, params=POLICY_PARAMS)
 
 
 @pytest.mark.parametrize("baseline", ["leave_one_out", "none"])
 def test_reinforce_is_unbiased_for_a_policy(key, baseline):
     """Mean and covariance of a linear system under a linear policy follow by recursion, and so the expected cost."""
     cost = closed_loop()
-    at = cost.ravel(POLICY)
+    at = cost.ravel(POLICY_PARAMS)
     exact = jax.jit(jax.grad(lambda p: cost.task.expected_cost(cost.unravel(p), 0.3)))(at)
     assert_within_error(reinforce(cost, at, key, num_samples=100_000, baseline=baseline), exact)
 
@@ -104,16 +94,6 @@ def test_reward_to_go_spares_a_late_action_the_variance_of_what_came_before(key)
     ratio = reinforce(cost, at, key, num_samples=4000).covariance_diagonal / whole.covariance_diagonal
     assert abs(ratio[0] - 1) < 0.01
     assert ratio[-1] < 0.3
-
-
-def test_the_error_bar_of_reinforce_is_the_spread_of_its_repetitions(key):
-    """2000 estimates of 30 rollouts; the spread of 2000 is known to about 1.6 %, and the share left out is 1/30."""
-    cost = closed_loop()
-    at = cost.ravel(POLICY)
-    repeated = eqx.filter_jit(jax.vmap(lambda k: estimators.reinforce(cost, at, k, num_samples=30)))
-    estimates = repeated(jax.random.split(key, 2000))
-    claimed = np.sqrt((np.asarray(estimates.standard_error) ** 2).mean(axis=0))
-    np.testing.assert_allclose(claimed, np.asarray(estimates.value).std(axis=0), rtol=0.1)
 
 
 def test_reinforce_leaves_out_and_counts_what_is_not_finite(key):

@@ -6,8 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
+import mjxgrad as mg
 from experiments.optimisation import published as settings
 from experiments.problems import published
 from experiments.problems.published import CENTRES, RADII
@@ -56,15 +58,10 @@ def test_a_step_is_charged_for_nothing_that_comes_later(name, key):
 
 
 def descend(task, estimator):
-    @jax.jit
-    def run(key):
-        def step(params, index):
-            estimate = estimator(task.objective, params, jax.random.fold_in(key, index), num_samples=task.num_samples)
-            return params - task.learning_rate * estimate.value, None
-
-        return task.final_cost(jax.lax.scan(step, task.params, jnp.arange(task.num_steps))[0])
-
-    return float(run(jax.random.key(0)))
+    sized = functools.partial(estimator, num_samples=task.num_samples)
+    settings = {"optimiser": optax.sgd(task.learning_rate), "num_steps": task.num_steps}
+    found = mg.optimise(task.objective, task.params, jax.random.key(0), estimator=sized, **settings).params
+    return float(eqx.filter_jit(task.final_cost)(found))
 
 
 def test_friction_separates_the_estimators_as_published():
