@@ -31,7 +31,7 @@ from mjxgrad.stepping import Contact, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
-_NONE, _BLIND = 0.05, 0.5  # shares of the truth: a bias that counts as none, and one that intervals must exclude
+_NONE, _BLIND = 0.05, 0.25  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
 
 def scene_task(
@@ -159,6 +159,9 @@ class Sweep(Printed):
         """The answer in a line: the stiffnesses where an estimate has no relevant bias, and none too small to see."""
         table, found = self.result.table(), {}
         truth = abs(table["truth"])
+        measured = [truth, *(table[f"{name}_bias"] for name in ESTIMATES if f"{name}_bias" in table)]
+        if len(truth) > 1 and not any(np.ptp(one, axis=0).any() for one in measured):
+            return "Stiffness changes nothing: nothing touches in these motions; start nearer, or look further ahead."
         for name, words in ESTIMATES.items():
             if f"{name}_bias" in table:
                 width = table[f"{name}_bias_high"] - table[f"{name}_bias_low"]

@@ -153,9 +153,9 @@ class Identification(Printed):
             )
         if self.has_noise and exceeds_noise(self.rms[1], self.num_numbers - len(self.names)):
             found.append(
-                f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the motion of the "
-                "scene is not the recorded one, and values may be off by more than their intervals. Try free_start=True, shorter "
-                "windows (recording.cut) or more parameters, or correct the stated noise."
+                f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
+                "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
+                "other first values, free_start=True, shorter windows (recording.cut) or more parameters, or correct the noise."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
