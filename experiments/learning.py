@@ -76,6 +76,8 @@ class Settings(RunSettings):
     """Steps of each environment per update."""
     actor_rate: Positive | None = None
     """Learning rate of the policy; if left out, the algorithm's."""
+    stddev: tuple[Positive, Positive] | None = None
+    """Standard deviations of the noise on actions at the beginning and at the end; if left out, the algorithm's."""
     critic_rate: Positive = learning.Settings.critic_rate
     """Learning rate of the value function."""
     trace: Annotated[float, Field(ge=0, le=1)] = learning.Settings.trace
@@ -302,7 +304,8 @@ def _judged_course(
 
 
 def _how(settings: Settings, method: Method) -> learning.Settings:
-    changes: dict[str, Any] = {} if settings.actor_rate is None else {"actor_rate": settings.actor_rate}
+    own = {"actor_rate": settings.actor_rate, "stddev": settings.stddev}
+    changes: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
     return (apg if settings.algorithm == "apg" else learning.Settings)(
         num_environments=settings.sizes.num_environments,
         window=settings.window,
