@@ -40,7 +40,7 @@ _GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix'
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
 _NUM_POINTS, _NUM_GENERATIONS = 256, 60  # of the search between the bounds
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
-_DIVERGED = 1e30  # sum of squares of a diverged motion
+_DIVERGED = 1e30  # loss of a diverged motion
 _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
 
 
@@ -60,8 +60,8 @@ def identify(
 
     Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
     derivatives through the simulation. Where it leaves more than the stated noise, as where contacts chatter, a second
-    descent begins where differential evolution ends between the bounds; not with `free_start`. Ctrl-C ends the search with
-    the best values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
+    descent begins where differential evolution of a robust loss ends between the bounds; not with `free_start`. Ctrl-C ends
+    the search with the best values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
 
     Args:
         scene: the scene with nominal values.
@@ -114,7 +114,7 @@ def identify(
         with contextlib.suppress(KeyboardInterrupt):
             again = _descend(program, program.searched(), max_steps, log)
         end = end._replace(stopped=again.stopped if again.stopped is Stopped.INTERRUPTED else end.stopped)
-        if _rms(program, again.found) < _rms(program, end.found):
+        if _robust(again.found[0]) < _robust(end.found[0]):
             end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
     return _identified(program, end, held_out, has_noise)
 
@@ -214,9 +214,15 @@ class _Program:
 
     def _sums(self, windows: Windows, vectors: Array) -> Float[Array, " points"]:
         """Return for each vector the sum of squares over all windows."""
+        return self._over_windows(lambda residual: jnp.sum(residual**2), windows, vectors)
 
+    def _losses(self, windows: Windows, vectors: Array) -> Float[Array, " points"]:
+        """Return for each vector the robust loss of all windows."""
+        return self._over_windows(_robust, windows, vectors)
+
+    def _over_windows(self, loss: Callable, windows: Windows, vectors: Array) -> Float[Array, " points"]:
         def of_one(vector: Array) -> Array:
-            return jnp.sum(jax.vmap(lambda window: self._residuals(vector, None, window))(windows) ** 2)
+            return loss(jax.vmap(lambda window: self._residuals(vector, None, window))(windows))
 
         return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
 
@@ -239,21 +245,23 @@ class _Program:
         """Return the best of many points between the bounds, by differential evolution.
 
         Hard contacts chatter: each switch of a contact makes the later motion jump, and the sum of squares has a minimum in
-        every cell between two jumps. Descent ends in the first of them.
+        every cell between two jumps. Descent ends in the first of them. After some jumps two motions have nothing in common,
+        and their squares drown what still tells. The robust loss counts the numbers that fit instead, such as all before
+        the first jump.
         """
         dtype = self.coordinates.nominal.dtype
         low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
 
-        def sums_at(points: Float[np.ndarray, "dim points"]) -> Float[np.ndarray, " points"]:
+        def losses_at(points: Float[np.ndarray, "dim points"]) -> Float[np.ndarray, " points"]:
             vectors = self.coordinates.values(jnp.asarray(points.T, dtype))
-            found = np.asarray(self._run(self._sums, self.windows, vectors), float)
+            found = np.asarray(self._run(self._losses, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
         points = np.random.default_rng(0).uniform(low, high, (_NUM_POINTS, len(low)))
         points[0] = 0.0  # the nominal values, at which no motion diverges
         settings: dict[str, Any] = {"maxiter": _NUM_GENERATIONS, "init": points, "rng": 0}
         settings |= {"polish": False, "vectorized": True, "updating": "deferred"}
-        best = scipy.optimize.differential_evolution(sums_at, list(zip(low, high, strict=True)), **settings)
+        best = scipy.optimize.differential_evolution(losses_at, list(zip(low, high, strict=True)), **settings)
         return jnp.asarray(best.x, dtype)
 
     def offsets(self, point: Array) -> Array | None:
@@ -270,6 +278,11 @@ class _Program:
         sums = compile_once(jax.jit(self._sums).lower(judged, vectors))(judged, vectors)
         first, last = np.sqrt(np.asarray(sums, float) / _num_numbers(judged))
         return float(first), float(last)
+
+
+def _robust(residual: Array) -> Float[Array, ""]:
+    """Return the Cauchy loss of residuals in units of their noise, which grows with their logarithm."""
+    return jnp.sum(jnp.log1p(residual**2))
 
 
 def _rms(program: _Program, found: tuple[Array, ...]) -> float:

@@ -247,9 +247,10 @@ class _Worker:
         if given is not self.given:
             self.given, self.model = given, copy.deepcopy(given)
             self.model.opt.tolerance, self.model.opt.iterations = _TOLERANCE, max(_ITERATIONS, given.opt.iterations)
-        if self.gradient == "slope" and given is not self.near_to:
+        if given is not self.near_to:
             alike, model = [k for k, one in enumerate(models) if one is given], self.model
-            self.surfaces = Surfaces(model, self.engine.levers, speeds[alike].reshape(-1, model.nv))
+            reached = speeds[alike].reshape(-1, model.nv)
+            self.surfaces = Surfaces(model, self.engine.levers, reached if self.gradient == "slope" else 0 * reached)
             self.near_to, self.far = given, mujoco.MjData(self.surfaces.model)
 
     @np.errstate(invalid="ignore", over="ignore")
@@ -337,14 +338,17 @@ class _Worker:
         self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
     ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
         """Return the model to take differences of, what is near, D, and the state about which differences cross no surface."""
-        near, nothing = None, np.zeros((0, 0))
-        if self.gradient == "slope" and np.isfinite(after).all():
+        near, nothing, is_slope = None, np.zeros((0, 0)), self.gradient == "slope"
+        if np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
-            near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
+            if is_slope or self.surfaces.are_within(_WIDTH, self.far):
+                near = self.surfaces.near(self.far, row[self.places["qvel"]] * is_slope, after * is_slope)
         if near is not None and near.is_undecided:
             model = min(undecided(model), key=lambda one: np.abs(self._step(one, row)[1] - after).max())
         if near is None or near.events is None:
-            return model, near, nothing, row
+            return model, near if is_slope else None, nothing, row
+        if not is_slope:
+            return model, None, nothing, self._moved(model, row, near.events.clearance(_WIDTH))
         spanned = self._spanned(model, row, events := near.events)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
             return model, dataclasses.replace(near, events=None), nothing, row

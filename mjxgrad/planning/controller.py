@@ -135,7 +135,9 @@ class Controller(Printed):
     def __str__(self) -> str:
         rate = f"{format_number(1 / float(np.median(self.seconds or [np.inf])))} Hz in the median"
         missed = f", {self.num_missed} missed {format_number(1e3 * self.deadline)} ms" if self.deadline else ""
-        return f"{len(self.seconds)} decisions, {rate}{missed}; compiled once, in {self.compile_seconds:.1f} s"
+        is_idle = self.seconds and np.array_equal(self.plan.controls, self._none.best.controls)
+        idle = ". Controls are as given, since no small change lowers the cost: begin with others" if is_idle else ""
+        return f"{len(self.seconds)} decisions, {rate}{missed}; compiled once, in {self.compile_seconds:.1f} s{idle}"
 
 
 def _inputs(factor: Any, following: Any, *, is_first: bool = False, is_shifted: bool = False) -> tuple[np.generic, ...]:

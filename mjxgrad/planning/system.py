@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
@@ -213,10 +213,16 @@ class GoalCost(Cost):
         control_weight: weight of each control.
     """
 
-    goal: StateVector
+    goal: StateVector = eqx.field(converter=jnp.asarray)
     stage_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     terminal_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
+
+    def __check_init__(self):
+        for name in ("stage_weight", "terminal_weight", "control_weight"):
+            weight = known(getattr(self, name))
+            if weight is not None and not (weight >= 0).all():
+                raise ValueError(f"{name} must be at least 0, got {weight}")
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
         away = self._weighted("stage_weight", system.difference(state, self.goal))
