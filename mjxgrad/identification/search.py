@@ -39,6 +39,10 @@ _GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix'
 # Least gain as a share of the noise variance, and steps in a row below it: badly determined parameters make it creep.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
 _NUM_POINTS, _NUM_GENERATIONS = 256, 60  # of the search between the bounds
+# Scale of the robust loss, of the noise: of 12 boxes that turn it finds all with 0.3, 10 with 1 or 0.1 and 5 with 10.
+_SHARE = 0.3
+_OVERSTATED = 0.5  # noise that is twice as large as the residuals tells nothing
+_MISFIT = 10.0  # by which residuals that no descent lowers exceed the noise, where it is not known
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
 _DIVERGED = 1e30  # loss of a diverged motion
 _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
@@ -108,15 +112,24 @@ def identify(
     start = program.start()
     end = _descend(program, start, max_steps, log)
     has_noise = all(set(one.noise) == set(one.measured) for one in recordings)
-    is_left = has_noise and not free_start and end.stopped is not Stopped.INTERRUPTED
-    if is_left and exceeds_noise(_rms(program, end.found), program.num_numbers - len(start)):
-        again = end._replace(stopped=Stopped.INTERRUPTED)
+    if _is_off(program, end, has_noise) and not free_start and end.stopped is not Stopped.INTERRUPTED:
+        noise = min(_rms(program, end.found) / _MISFIT, 1.0 if has_noise else math.inf)
+        loss, again = functools.partial(_robust, scale=_SHARE * noise), end._replace(stopped=Stopped.INTERRUPTED)
         with contextlib.suppress(KeyboardInterrupt):
-            again = _descend(program, program.searched(), max_steps, log)
+            again = _descend(program, program.searched(loss), max_steps, log)
         end = end._replace(stopped=again.stopped if again.stopped is Stopped.INTERRUPTED else end.stopped)
-        if _robust(again.found[0]) < _robust(end.found[0]):
+        if loss(again.found[0]) < loss(end.found[0]):
             end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
     return _identified(program, end, held_out, has_noise)
+
+
+def _is_off(program: "_Program", end: "_End", has_noise: bool) -> bool:
+    """Return whether a descent left more than noise; if that is not known, whether its linear model would remove much more."""
+    after = _rms(program, end.found)
+    if has_noise and after > _OVERSTATED:
+        return exceeds_noise(after, program.num_numbers - len(program.start()))
+    rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
+    return end.removable > _STALLED and after > max(rounding, 1e-6) * end.first
 
 
 class _End(NamedTuple):
@@ -139,9 +152,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
     signals = explained[0].reshape(*program.windows.index.shape, -1)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
-    after, before = np.linalg.norm(residual), end.first * np.sqrt(numbers)
-    rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
-    stalls = end.removable > _STALLED and after > max(rounding, 1e-6) * before
+    stalls = end.removable > _STALLED and _is_off(program, end, has_noise)
     nominal = np.asarray(coordinates.nominal, float)
     is_at_bound = coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype))
     return Identification(
@@ -150,7 +161,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
         start=coordinates.unravel(nominal),
         names=coordinates.names,
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
-        rms=(end.first, float(after / np.sqrt(numbers))),
+        rms=(end.first, float(np.linalg.norm(residual) / np.sqrt(numbers))),
         has_noise=has_noise,
         held_out_rms=None if end.stopped is Stopped.INTERRUPTED else program.held_out_rms(held_out, nominal, values),
         offsets=np.asarray(program.offsets(end.point)) if program.free_start else None,
@@ -216,10 +227,6 @@ class _Program:
         """Return for each vector the sum of squares over all windows."""
         return self._over_windows(lambda residual: jnp.sum(residual**2), windows, vectors)
 
-    def _losses(self, windows: Windows, vectors: Array) -> Float[Array, " points"]:
-        """Return for each vector the robust loss of all windows."""
-        return self._over_windows(_robust, windows, vectors)
-
     def _over_windows(self, loss: Callable, windows: Windows, vectors: Array) -> Float[Array, " points"]:
         def of_one(vector: Array) -> Array:
             return loss(jax.vmap(lambda window: self._residuals(vector, None, window))(windows))
@@ -241,20 +248,20 @@ class _Program:
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
-    def searched(self) -> Array:
-        """Return the best of many points between the bounds, by differential evolution.
+    def searched(self, loss: Callable[[Array], Array]) -> Array:
+        """Return the best of many points between the bounds, by differential evolution of a loss of the residuals.
 
         Hard contacts chatter: each switch of a contact makes the later motion jump, and the sum of squares has a minimum in
         every cell between two jumps. Descent ends in the first of them. After some jumps two motions have nothing in common,
-        and their squares drown what still tells. The robust loss counts the numbers that fit instead, such as all before
-        the first jump.
+        and their squares drown what still tells. A robust loss counts the numbers that fit instead, such as all before the
+        first jump.
         """
-        dtype = self.coordinates.nominal.dtype
+        dtype, losses = self.coordinates.nominal.dtype, functools.partial(self._over_windows, loss)
         low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
 
         def losses_at(points: Float[np.ndarray, "dim points"]) -> Float[np.ndarray, " points"]:
             vectors = self.coordinates.values(jnp.asarray(points.T, dtype))
-            found = np.asarray(self._run(self._losses, self.windows, vectors), float)
+            found = np.asarray(self._run(losses, self.windows, vectors), float)
             return np.where(np.isfinite(found), found, _DIVERGED)
 
         points = np.random.default_rng(0).uniform(low, high, (_NUM_POINTS, len(low)))
@@ -280,9 +287,9 @@ class _Program:
         return float(first), float(last)
 
 
-def _robust(residual: Array) -> Float[Array, ""]:
-    """Return the Cauchy loss of residuals in units of their noise, which grows with their logarithm."""
-    return jnp.sum(jnp.log1p(residual**2))
+def _robust(residual: Array, *, scale: float) -> Float[Array, ""]:
+    """Return the Cauchy loss of residuals, which grows with their logarithm beyond the scale."""
+    return jnp.sum(jnp.log1p((residual / scale) ** 2))
 
 
 def _rms(program: _Program, found: tuple[Array, ...]) -> float:

@@ -57,7 +57,7 @@ def test_an_interruption_of_the_second_search_keeps_the_first_ones_values(cart, 
     if part == "searched":
         monkeypatch.setattr(search._Program, "searched", _interrupted)
     else:
-        monkeypatch.setattr(search._Program, "searched", lambda program: program.start())
+        monkeypatch.setattr(search._Program, "searched", lambda program, loss: program.start())
         calls = iter([search._descend, _interrupted])
         monkeypatch.setattr(search, "_descend", lambda *given: next(calls)(*given))
     result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [_noisy()])
