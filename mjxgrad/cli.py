@@ -104,7 +104,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except cyclopts.CycloptsError as error:
-        _say(f"{str(error).rstrip('.')}; mjxgrad --help lists the commands")
+        command = " ".join(["mjxgrad", *(error.command_chain or ())])
+        _say(f"{str(error).rstrip('.')}; {command} --help lists what there is")
     # The library refuses by these errors, in a sentence; any other error is a bug.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
