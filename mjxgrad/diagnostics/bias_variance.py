@@ -49,6 +49,7 @@ _BATCH = 16
 _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
 ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
+_HIDDEN = 30.0  # times the usual gradient
 _LOOKS = {"first": ("#d55e00", "o", "-"), "zeroth": ("#0072b2", "s", "--"), "alpha_order": ("#009e73", "D", ":")}
 _NORMAL = 10**6  # samples, of which Student's t distribution is normal
 _TOO_STIFF = "without gaining energy"  # part of the warning about a contact that the time step cannot follow
@@ -252,6 +253,10 @@ class BiasVariance(eqx.Module, Printed):
                         look = {"color": colour, "marker": marker, "ls": line, "label": ESTIMATES[name]}
                         axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
             lower.set(xlabel=title, yscale="log", xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
+        # Where contact is so stiff that derivatives explode, a linear axis would hide all other biases.
+        usual = float(np.median(np.abs(table["truth"])))
+        if max(map(abs, axes[0, 0].get_ylim())) > _HIDDEN * usual > 0:
+            axes[0, 0].set_yscale("symlog", linthresh=10 ** np.ceil(np.log10(usual)))
         axes[0, 0].set_ylabel("bias of the gradient (cost per unit)")
         axes[1, 0].set_ylabel("variance of one rollout")
         axes[0, 0].legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2)

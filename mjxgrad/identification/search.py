@@ -267,7 +267,13 @@ class _Program:
         points = np.random.default_rng(0).uniform(low, high, (_NUM_POINTS, len(low)))
         points[0] = 0.0  # the nominal values, at which no motion diverges
         settings: dict[str, Any] = {"maxiter": _NUM_GENERATIONS, "init": points, "rng": 0}
-        settings |= {"polish": False, "vectorized": True, "updating": "deferred", "mutation": (0.3, 0.9), "recombination": 0.9}
+        settings |= {
+            "polish": False,
+            "vectorized": True,
+            "updating": "deferred",
+            "mutation": (0.3, 0.9),
+            "recombination": 0.9,
+        }
         best = scipy.optimize.differential_evolution(losses_at, list(zip(low, high, strict=True)), **settings)
         return jnp.asarray(best.x, dtype)
 
