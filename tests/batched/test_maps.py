@@ -132,7 +132,16 @@ def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
-CONTRACTIONS = "nij,njk->nik nij,nj->ni ik,jk->ij cdv,cd->v cka,va->ckv i,i-> ni,n->ni ija,aj->ji".split()
+CONTRACTIONS = [
+    "nij,njk->nik",
+    "nij,nj->ni",
+    "ik,jk->ij",
+    "cdv,cd->v",
+    "cka,va->ckv",
+    "i,i->",
+    "ni,n->ni",
+    "ija,aj->ji",
+]
 _SIZES = dict(zip("nijkcdva", (4, 3, 2, 5, 2, 3, 4, 6), strict=True))
 
 

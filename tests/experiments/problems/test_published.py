@@ -16,7 +16,6 @@ from experiments.problems.published import CENTRES, RADII
 from mjxgrad import estimators
 
 NAMES = tuple(settings.TASKS)
-LEVEL_PAD = [0.0, 0.0, 0.0]
 
 
 @functools.cache
@@ -57,20 +56,16 @@ def test_a_step_is_charged_for_nothing_that_comes_later(name, key):
     assert (before[later:] != after[later:]).any()
 
 
-def descend(task, estimator):
-    sized = functools.partial(estimator, num_samples=task.num_samples)
-    settings = {"optimiser": optax.sgd(task.learning_rate), "num_steps": task.num_steps}
-    found = mg.optimise(task.objective, task.params, jax.random.key(0), estimator=sized, **settings).params
-    return float(eqx.filter_jit(task.final_cost)(found))
-
-
 def test_friction_separates_the_estimators_as_published():
     """First order does not see that the bodies can stay together, zeroth order does."""
     task = setting("friction")
+    settings = {"optimiser": optax.sgd(task.learning_rate), "num_steps": task.num_steps}
     zeroth = functools.partial(estimators.zeroth_order, baseline="zero_noise")
     for name, estimator in (("first", estimators.first_order), ("zeroth", zeroth)):
+        sized = functools.partial(estimator, num_samples=task.num_samples)
+        found = mg.optimise(task.objective, task.params, jax.random.key(0), estimator=sized, **settings).params
         mean, stddev = task.reference[name]
-        assert abs(descend(task, estimator) - mean) < 3 * stddev, name
+        assert abs(eqx.filter_jit(task.final_cost)(found) - mean) < 3 * stddev, name
 
 
 def test_bodies_apart_move_freely():
@@ -128,7 +123,7 @@ def test_an_elastic_bounce_keeps_the_speed_and_mirrors_the_path(angle):
 
 
 def test_a_ball_beyond_the_pad_s_end_flies_on_and_slows_down():
-    moved = published.tennis().advance(jnp.array([0.96, 0.21, 0.0, -0.4, *LEVEL_PAD]), jnp.array([0.2, 0.1, 0.4]))
+    moved = published.tennis().advance(jnp.array([0.96, 0.21, 0.0, -0.4, 0.0, 0.0, 0.0]), jnp.array([0.2, 0.1, 0.4]))
     np.testing.assert_allclose(moved, [0.96, 0.19, 0.0, -0.4 * 0.999, 0.01, 0.005, 0.02], rtol=1e-12)
 
 
