@@ -121,22 +121,14 @@ def signals():
         signal.signal(number, handler)
 
 
-_SHORT = ["--samples", "4", "--horizon", "20", "--engine", "mujoco"]
+_SWEEP = ["sweep", "scene.xml", "--samples", "4", "--horizon", "20", "--engine", "mujoco", "--stiffness", "1e3", "1e5"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "at", "said"),
     [
-        (
-            ["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"],
-            "1 of 3",
-            "Interrupted: 2 of 3 stiffnesses are left out.",
-        ),
-        (
-            ["sweep", "scene.xml", *_SHORT, "--stiffness", "1e3", "1e5"],
-            "2 of 3",
-            "Interrupted: 1 of 3 stiffnesses are left out.",
-        ),
+        (_SWEEP, "1 of 3", "Interrupted: 2 of 3 stiffnesses are left out."),
+        (_SWEEP, "2 of 3", "Interrupted: 1 of 3 stiffnesses are left out."),
         ([*_IDENTIFY[:4], "gear:push"], "step 1:", "The search was interrupted: do not trust the values."),
         (["check", "scene.xml"], "derivatives over", "Derivatives were not measured"),
     ],

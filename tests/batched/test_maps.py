@@ -55,9 +55,8 @@ def _sizes(bilinear):
 
 
 @pytest.mark.parametrize("evaluate", _WAYS)
-@pytest.mark.parametrize("name", BILINEAR)
-def test_a_bilinear_map_is_its_sum(name, evaluate):
-    bilinear = BILINEAR[name]
+@pytest.mark.parametrize("bilinear", BILINEAR.values(), ids=BILINEAR)
+def test_a_bilinear_map_is_its_sum(bilinear, evaluate):
     sizes = _sizes(bilinear)
     a, b = (_normal(seed, (3, 2, size)) for seed, size in enumerate(sizes))
     found = evaluate(a, b, terms=bilinear._terms, size=bilinear._size, batch=0)
@@ -66,9 +65,8 @@ def test_a_bilinear_map_is_its_sum(name, evaluate):
     )
 
 
-@pytest.mark.parametrize("name", BILINEAR)
-def test_an_entry_that_is_no_number_spoils_only_what_is_made_of_it(name):
-    bilinear = BILINEAR[name]
+@pytest.mark.parametrize("bilinear", BILINEAR.values(), ids=BILINEAR)
+def test_an_entry_that_is_no_number_spoils_only_what_is_made_of_it(bilinear):
     sizes = _sizes(bilinear)
     a, b = (jnp.ones(size) for size in sizes)
     for entry in range(sizes[0]):
@@ -98,9 +96,8 @@ def test_chosen_items_have_the_derivative_of_an_index():
     np.testing.assert_allclose(pulled, jnp.zeros_like(x).at[index].add(cotangent), rtol=1e-14)
 
 
-@pytest.mark.parametrize("name", BILINEAR)
-def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
-    bilinear = BILINEAR[name]
+@pytest.mark.parametrize("bilinear", BILINEAR.values(), ids=BILINEAR)
+def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(bilinear):
     sizes = _sizes(bilinear)
     table = _table(bilinear, *sizes)
     a, b, cotangent = (_normal(size, (4, size)) for size in (*sizes, bilinear._size))
@@ -111,18 +108,16 @@ def test_the_transposes_of_a_bilinear_map_are_those_of_its_sum(name):
 
 @pytest.mark.parametrize("evaluate", [maps._linear_by_slices, maps._linear_by_gathers])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("name", LINEAR)
-def test_a_linear_map_is_its_sum(name, axis, evaluate):
-    matrix = LINEAR[name]
+@pytest.mark.parametrize("matrix", LINEAR.values(), ids=LINEAR)
+def test_a_linear_map_is_its_sum(matrix, axis, evaluate):
     x = _normal(0, np.insert([3, 2], axis, matrix.shape[1]))
     found = evaluate(x, matrix=maps._Matrix(matrix), batch=axis)
     np.testing.assert_allclose(found, np.moveaxis(np.tensordot(matrix, x, (1, axis)), 0, axis), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("batch", [0, 1])
-@pytest.mark.parametrize("name", LINEAR)
-def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(name, batch):
-    matrix = LINEAR[name]
+@pytest.mark.parametrize("matrix", LINEAR.values(), ids=LINEAR)
+def test_the_transpose_of_a_linear_map_is_that_of_its_matrix(matrix, batch):
     shapes = [np.insert([size, 2], batch, 3) for size in matrix.shape[::-1]]
     x, cotangent = (_normal(seed, shape) for seed, shape in enumerate(shapes))
     mapped = jax.vmap(lambda x: maps.combine(matrix, x), batch, batch)

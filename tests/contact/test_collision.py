@@ -12,7 +12,7 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.collision import collide, slot_geoms
 from tests.contact.test_capsules import TILTED, by_pair_and_depth, finder, loaded, poses
-from tests.scenes import central_difference
+from tests.scenes import central_difference, put
 
 # Two boxes that do not meet, over two tilted planes; margins beyond all distances, so that C MuJoCo reports every corner.
 BOXES = """
@@ -126,8 +126,7 @@ def test_of_many_balls_the_nearest_to_something_else_are_found(kind):
     xml = "<mujoco><custom>{}</custom><worldbody><body><freejoint/><geom {}/></body>{}</worldbody></mujoco>"
     found = []
     for numbers in ('<numeric name="max_geom_pairs" data="2"/>', ""):
-        model = mjx.put_model(mujoco.MjModel.from_xml_string(xml.format(numbers, kind, balls)))
-        data = mjx.make_data(model)
+        model, data = put(xml.format(numbers, kind, balls))
         contact = finder(model, data)(data.qpos)
         is_with_it = np.asarray(contact.geom == 0).any(axis=1)
         found.append(np.column_stack([contact.dist, contact.pos, contact.frame[:, 0]])[is_with_it])

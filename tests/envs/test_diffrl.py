@@ -10,14 +10,8 @@ from mjxgrad.rollouts import initial_state
 
 # Turned by 0.4 about the vertical, then by 0.3 about the own y: R = Rz(0.4) Ry(0.3).
 LEAN, TURN = 0.3, 0.4
-QUATERNION = np.array(
-    [
-        np.cos(TURN / 2) * np.cos(LEAN / 2),
-        -np.sin(TURN / 2) * np.sin(LEAN / 2),
-        np.cos(TURN / 2) * np.sin(LEAN / 2),
-        np.sin(TURN / 2) * np.cos(LEAN / 2),
-    ]
-)
+(_CT, _CL), (_ST, _SL) = (function(np.array([TURN, LEAN]) / 2) for function in (np.cos, np.sin))
+QUATERNION = np.array([_CT * _CL, -_ST * _SL, _CT * _SL, _ST * _CL])
 UPRIGHT = np.cos(LEAN)  # the z of the own z
 HEADING = np.cos(TURN) * np.cos(LEAN)  # the x of the own x
 

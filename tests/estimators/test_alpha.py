@@ -36,8 +36,7 @@ def test_the_ends_of_alpha_are_first_order_and_the_control_variate(parts):
 
 
 def test_without_control_variate_the_unbiased_part_is_zeroth_order(parts):
-    key = parts[0]
-    rule = rules.FixedAlpha(0.0)
+    key, rule = parts[0], rules.FixedAlpha(0.0)
     # Up to 64 samples are one group, in which each leaves itself out, as in the zeroth-order estimate.
     estimate = alpha_order(BUMPY, POINT, key, num_samples=64, rule=rule, control_variate=False)
     zeroth = textbook.zeroth_order(BUMPY, POINT, key, num_samples=64)
@@ -57,9 +56,7 @@ def test_a_quadratic_is_always_left_to_first_order():
     """The trapezoidal rule is exact for it, whatever its curvature and however near its minimum."""
     matrix = jnp.array([[30.0, 1.0, 0.0], [1.0, 0.01, 0.2], [0.0, 0.2, -4.0]])
     objective = parameter_noise(lambda x: 1e4 + x @ matrix @ x, STDDEVS)
-    keys = jax.random.split(jax.random.key(0), 500)
-    run = jax.jit(jax.vmap(lambda k: estimators.alpha_order(objective, jnp.zeros(3), k, num_samples=10)))
-    estimates = run(keys)
+    estimates = repeat(estimators.alpha_order, objective, jnp.zeros(3), 500, seed=0, num_samples=10)
     assert not np.any(jax.tree.leaves(estimates.reason)[0] == jax.tree.leaves(Reason.inconsistent)[0])
     assert np.all(np.asarray(estimates.alpha) > 0)
 
@@ -67,10 +64,8 @@ def test_a_quadratic_is_always_left_to_first_order():
 def test_a_jump_between_samples_is_always_seen():
     """A step on a slope at ten samples: either all fall on one side, with chance 2/2^10 here, or the jump is seen."""
     objective = parameter_noise(lambda x: 3 * x[0] + jnp.where(x[0] >= 0, 1.0, 0.0), 0.1, dim=1)
-    keys = jax.random.split(jax.random.key(0), 4000)
-    run = jax.jit(jax.vmap(lambda k: estimators.alpha_order(objective, jnp.zeros(1), k, num_samples=10)))
-    accepted = (np.asarray(run(keys).alpha) > 0).mean()
-    assert accepted < 0.01
+    estimates = repeat(estimators.alpha_order, objective, jnp.zeros(1), 4000, seed=0, num_samples=10)
+    assert (estimates.alpha > 0).mean() < 0.01
 
 
 def test_the_bound_on_the_bias_holds_for_a_small_jump_in_many_dimensions(key):

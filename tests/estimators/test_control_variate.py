@@ -13,7 +13,7 @@ from mjxgrad import estimators
 from mjxgrad.estimators import Diagnosis, rules
 from mjxgrad.objective import closed_loop, parameter_noise
 from tests.estimators import textbook
-from tests.estimators.textbook import POINT, STDDEVS, repeat
+from tests.estimators.textbook import POINT, POLICY_PARAMS, STDDEVS, repeat
 from tests.objective.test_objective import Laplace
 
 control_variate = eqx.filter_jit(estimators.control_variate)
@@ -70,9 +70,9 @@ class TwoStarts(textbook.LinearSystem):
 def test_it_is_unbiased_in_closed_loop_from_random_starts_and_so_are_baselines_from_the_same_start(
     estimator, num_rollouts
 ):
-    task, params = TwoStarts(), {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
-    objective = closed_loop(task, textbook.linear_policy, 0.2, params=params)
-    flat = objective.ravel(params)
+    task = TwoStarts()
+    objective = closed_loop(task, textbook.linear_policy, 0.2, params=POLICY_PARAMS)
+    flat = objective.ravel(POLICY_PARAMS)
     estimates = repeat(estimator, objective, flat, 20_000, seed=3, num_samples=8)
     truth = jax.jit(jax.grad(lambda at: task.expected_cost(objective.unravel(at), 0.2)))(flat)
     assert_unbiased_with_right_errors(estimates, np.asarray(truth), 8)
@@ -87,11 +87,9 @@ def test_baselines_from_the_same_start_take_away_what_starts_do():
         def sample_start(self, key):
             return self.start + 10 * jax.random.normal(key, (2,))
 
-    params = {"gain": jnp.array([[-0.3, 0.2]]), "offset": jnp.array([0.1])}
-    objective = closed_loop(FarStarts(), textbook.linear_policy, 0.1, params=params)
-    flat = objective.ravel(params)
-    rule = rules.FixedAlpha(0.0)
-    paired = functools.partial(estimators.alpha_order, rule=rule, control_variate=False)
+    objective = closed_loop(FarStarts(), textbook.linear_policy, 0.1, params=POLICY_PARAMS)
+    flat = objective.ravel(POLICY_PARAMS)
+    paired = functools.partial(estimators.alpha_order, rule=rules.FixedAlpha(0.0), control_variate=False)
     from_same_start = functools.partial(estimators.zeroth_order, baseline="zero_noise")
     partner, silence, others = (
         np.asarray(repeat(estimator, objective, flat, 500, seed=3, num_samples=20).value).std(axis=0)

@@ -1,7 +1,5 @@
 """Parameters that are a dict or an equinox module: the estimate has their form, and the numbers are those of the vector."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,19 +33,14 @@ def leaves(tree):
 OBJECTIVE = parameter_noise(lambda tree: textbook.bumpy(leaves(tree)), STDDEV)
 
 
-@functools.cache
-def of_the_vector(name):
-    return eqx.filter_jit(getattr(estimators, name))(VECTOR_OBJECTIVE, VECTOR, jax.random.key(7), num_samples=20)
-
-
 @pytest.mark.parametrize(
     ("name", "form"),
     [*((name, "dict") for name in ("zeroth_order", "alpha_order", "control_variate")), ("first_order", "module")],
 )
 def test_an_estimate_has_the_form_of_the_parameters(key, name, form):
-    estimator = functools.partial(getattr(estimators, name), num_samples=20)
-    tree = eqx.filter_jit(estimator)(OBJECTIVE, FORMS[form], key)
-    vector = of_the_vector(name)
+    estimator = eqx.filter_jit(getattr(estimators, name))
+    tree = estimator(OBJECTIVE, FORMS[form], key, num_samples=20)
+    vector = estimator(VECTOR_OBJECTIVE, VECTOR, key, num_samples=20)
     arrays = eqx.filter(FORMS[form], eqx.is_array)
     for field in ("value", "standard_error", "covariance_diagonal"):
         found = getattr(tree, field)

@@ -20,6 +20,7 @@ from mjxgrad import envs, initial_state, learning
 from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.learning.learner import ActorCritic
 from mjxgrad.loop import side_by_side
+from tests.loop.test_checkpoint import KilledError, kill_at
 
 SMALL = learning.Settings(num_environments=4, window=3, actor_layers=(6,), critic_layers=(6,), critic_iterations=2)
 
@@ -29,30 +30,13 @@ def cartpole():
     return envs.load("diffrl_cartpole")
 
 
-def same(a, b):
-    as_numbers = functools.partial(jax.tree.map, lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x))
-    return jax.tree.all(jax.tree.map(np.array_equal, as_numbers(a), as_numbers(b)))
-
-
-def _is_key(x):
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-class StoppedError(Exception):
-    pass
-
-
 def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     learn = functools.partial(learning.learn, cartpole, key, num_updates=2, log_every=1, settings=SMALL)
     whole = learn()
-
-    def stop(update, metrics):
-        raise StoppedError
-
-    with pytest.raises(StoppedError):
-        learn(checkpoint=tmp_path / "run", log=stop)
+    with pytest.raises(KilledError):
+        learn(checkpoint=tmp_path / "run", log=kill_at(1, KilledError))
     resumed = learn(checkpoint=tmp_path / "run")
-    assert same(resumed.learner, whole.learner)
+    assert eqx.tree_equal(resumed.learner, whole.learner)
     for name in whole.history.keys() - {"seconds"}:
         np.testing.assert_array_equal(resumed.history[name], whole.history[name])
     longer = learn(num_updates=3, checkpoint=tmp_path / "run")

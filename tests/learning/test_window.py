@@ -123,15 +123,9 @@ def gradients_at(cartpole, networks):
             discount=DISCOUNT,
             trace=trace,
         )
-        return jax.vmap(lambda state, key, noise: one(state, key, noise))(states, keys, noise)
+        return jax.vmap(one)(states, keys, noise)
 
     return run
-
-
-def gain(cartpole, networks, state, added):
-    actor, critic, normaliser = networks
-    window, _ = run_window(cartpole, state, actor, normaliser, added)
-    return returned(window, lambda obs: critic(normaliser(obs)), DISCOUNT)
 
 
 @pytest.mark.parametrize("trace", [0.6, 1.0])
@@ -238,7 +232,12 @@ def test_pulled_back_it_is_the_derivative_by_the_parameters(cartpole, networks, 
     start = cartpole.reset(key)
     noise = jnp.array([[0.4], [-1.2], [0.7]])
     window, _, found = gradients_at(jax.tree.map(lambda x: x[None], start), noise[None])
-    whole = jax.jit(jax.grad(lambda a: gain(cartpole, (a, critic, normaliser), start, STDDEV * noise)))(actor)
+
+    def gain(actor):
+        ran, _ = run_window(cartpole, start, actor, normaliser, STDDEV * noise)
+        return returned(ran, lambda obs: critic(normaliser(obs)), DISCOUNT)
+
+    whole = jax.jit(jax.grad(gain))(actor)
     _, pull_back = jax.vjp(lambda a: jax.vmap(lambda seen: a(normaliser(seen)[:3]))(window.seen[0]), actor)
     (pulled,) = pull_back(found.first[0])
     jax.tree.map(lambda x, y: assert_allclose(x, y, rtol=1e-9, atol=1e-12), pulled, whole)

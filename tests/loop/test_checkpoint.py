@@ -100,28 +100,22 @@ def test_a_checkpoint_of_another_run_is_refused(written, settings, sentence):
         run(written, **settings)
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "not_an_archive"])
-def test_a_damaged_checkpoint_is_refused(tmp_path, written, damage):
-    content = bytearray(written.read_bytes())
-    if damage == "cut":
-        content = content[: len(content) // 2]
-    elif damage == "flipped":
-        content[len(content) // 3] ^= 0xFF
-    else:
-        content = b"something else"
+def flipped(content):
+    place = len(content) // 3
+    return content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("damaged", [lambda x: x[: len(x) // 2], flipped, lambda _: b"something else"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, written, damaged):
     path = tmp_path / "run.npz"
-    path.write_bytes(content)
-    with pytest.raises(
-        ValueError, match=r"checkpoint must be a file that a run has saved, got .*delete it to begin anew"
-    ):
+    path.write_bytes(damaged(written.read_bytes()))
+    with pytest.raises(ValueError, match=r"checkpoint must be a file that a run has saved, .*delete it to begin anew"):
         run(path)
 
 
-def test_a_save_that_fails_leaves_the_former_file(tmp_path, monkeypatch):
-    path = tmp_path / "run.npz"
-    with pytest.raises(KilledError):
-        run(path, log=kill_at(7, KilledError))
-    before = path.read_bytes()
+def test_a_save_that_fails_leaves_the_former_file(tmp_path, written, monkeypatch):
+    path, before = tmp_path / "run.npz", written.read_bytes()
+    path.write_bytes(before)
 
     def fail(*_):
         raise OSError("disk full")

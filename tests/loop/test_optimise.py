@@ -115,7 +115,8 @@ def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
 
     def every_other(objective, params, key):
         gradient = problems.exact(objective, params, key).value
-        return made_up(jnp.where(is_odd(key), jnp.nan, gradient))
+        is_odd = jax.random.key_data(key).sum() % 2 == 1
+        return made_up(jnp.where(is_odd, jnp.nan, gradient))
 
     with_gaps = run(key, every_other, optimiser=optax.adam(0.1), num_steps=40)
     is_taken = with_gaps.history.is_taken
@@ -126,15 +127,6 @@ def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
     np.testing.assert_array_equal(with_gaps.history.step_norm == 0, ~is_taken)
 
 
-def is_odd(key):
-    return jax.random.key_data(key).sum() % 2 == 1
-
-
-def test_a_run_that_never_took_a_step_does_not_say_that_all_were_done(key):
-    result = run(key, lambda *_: made_up([jnp.nan, 0.0]), num_steps=3)
-    assert result.stopped == mg.Stopped.not_finite
-
-
 def test_a_result_is_shown_as_a_sentence(zeroth_order_run):
     """By `print`, and by IPython as a notebook does."""
     assert pretty(zeroth_order_run) == str(zeroth_order_run)
@@ -143,10 +135,11 @@ def test_a_result_is_shown_as_a_sentence(zeroth_order_run):
     )
 
 
-def test_a_run_gives_up_after_steps_in_a_row_that_are_not_finite(key):
-    result = run(key, lambda *_: made_up([jnp.nan, 0.0]), patience=4)
+@pytest.mark.parametrize("settings", [{"num_steps": 3}, {"patience": 4}])
+def test_a_run_gives_up_after_steps_in_a_row_that_are_not_finite_and_never_says_that_all_were_done(key, settings):
+    result = run(key, lambda *_: made_up([jnp.nan, 0.0]), **settings)
     assert result.stopped == mg.Stopped.not_finite
-    assert result.num_steps == result.num_skipped == 4
+    assert [result.num_steps, result.num_skipped] == [*settings.values()] * 2
     np.testing.assert_array_equal(result.params, START)
 
 

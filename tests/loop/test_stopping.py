@@ -16,11 +16,8 @@ from tests.loop.problems import START, made_up
 
 def test_a_log_is_told_the_last_step_of_every_segment(key):
     told = []
-    log, settings = (
-        lambda *step_and_metrics: told.append(step_and_metrics),
-        {"optimiser": optax.sgd(0.1), "num_steps": 60},
-    )
-    result = mg.optimise(problems.objective, START, key, estimator=problems.exact, log=log, **settings)
+    settings = {"optimiser": optax.sgd(0.1), "num_steps": 60, "log": lambda *told_now: told.append(told_now)}
+    result = mg.optimise(problems.objective, START, key, estimator=problems.exact, **settings)
     assert [step for step, _ in told] == list(range(3, 61, 3))
     assert mg.Stopped[result.stopped] == "all steps were done"
     for step, metrics in told:

@@ -53,24 +53,18 @@ def dense():
     return np.concatenate(rows), np.concatenate(right)
 
 
-@pytest.fixture(scope="module")
-def planned():
-    """From a limit to the plan of the linear problem."""
-    cost = GoalCost(GOAL, STAGE, TERMINAL, CONTROL)
-
-    @eqx.filter_jit
-    def run(limit):
-        system = FunctionSystem(affine, 2, 2)
-        return optimise_trajectory(
-            system, cost, START, jnp.zeros((HORIZON, 2)), jax.random.key(0), smoother=Exact(),
-            schedule=np.ones(25), lower=-limit, upper=limit,
-        )  # fmt: skip
-
-    return run
+@eqx.filter_jit
+def planned(limit):
+    """Return the plan of the linear problem."""
+    system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL, STAGE, TERMINAL, CONTROL)
+    return optimise_trajectory(
+        system, cost, START, jnp.zeros((HORIZON, 2)), jax.random.key(0), smoother=Exact(),
+        schedule=np.ones(25), lower=-limit, upper=limit,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("limit", [1e3, 2.0])
-def test_a_linear_plan_is_the_optimum_of_dense_least_squares(planned, limit):
+def test_a_linear_plan_is_the_optimum_of_dense_least_squares(limit):
     G, r = dense()
     expected = lsq_linear(G, r, (-limit, limit), tol=1e-13)
     plan = planned(jnp.array(limit))
@@ -82,7 +76,7 @@ def test_a_linear_plan_is_the_optimum_of_dense_least_squares(planned, limit):
     assert plan.converged
 
 
-def test_one_step_on_a_linear_problem_falls_by_what_it_promised(planned):
+def test_one_step_on_a_linear_problem_falls_by_what_it_promised():
     plan = planned(jnp.array(1e3))
     np.testing.assert_allclose(plan.iterations.promised[0], plan.start_cost - plan.iterations.cost[0], rtol=1e-6)
     assert plan.iterations.step[0] == 1
@@ -128,27 +122,18 @@ def test_a_step_that_would_leave_finite_numbers_is_shortened():
     assert not plan.diverged
 
 
-@pytest.fixture(scope="module")
-def pushing():
-    """From a smoother to the plan that brings the block from 0 to 1; the finger starts short of it."""
-
-    def run(smoother):
-        cost = GoalCost(jnp.array([0.0, 1.0]), jnp.zeros(2), jnp.array([0.0, 10.0]), 0.01)
-
-        @eqx.filter_jit
-        def plan(smoother):
-            return optimise_trajectory(
-                FunctionSystem(pushed, 2, 1), cost, jnp.array([-GAP, 0.0]), jnp.zeros((8, 1)), jax.random.key(0),
-                smoother=smoother, schedule=np.geomspace(1, 0.01, 25), lower=-0.4, upper=0.4,
-            )  # fmt: skip
-
-        return plan(smoother)
-
-    return run
+@eqx.filter_jit
+def pushing(smoother):
+    """Return the plan that brings the block from 0 to 1; the finger starts short of it."""
+    cost = GoalCost(jnp.array([0.0, 1.0]), jnp.zeros(2), jnp.array([0.0, 10.0]), 0.01)
+    return optimise_trajectory(
+        FunctionSystem(pushed, 2, 1), cost, jnp.array([-GAP, 0.0]), jnp.zeros((8, 1)), jax.random.key(0),
+        smoother=smoother, schedule=np.geomspace(1, 0.01, 25), lower=-0.4, upper=0.4,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("order", ["first", "zeroth"])
-def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models(pushing, order):
+def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models(order):
     plan = pushing(Sampled(0.3, 0.05, 30, order))
     # The finger's way is GAP + 1 in eight steps, at the least (1 + GAP)² / 8 squared controls, half of it at a weight of 0.01.
     assert plan.cost < 1.5 * 0.5 * 0.01 * (1 + GAP) ** 2 / 8
@@ -158,12 +143,12 @@ def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models(pushing, 
     assert not plan.unmoved.any()
 
 
-def test_a_shifted_plan_goes_on_where_the_first_steps_end_and_holds_its_last_control(planned):
+def test_a_shifted_plan_goes_on_where_the_first_steps_end_and_holds_its_last_control():
     plan = planned(jnp.array(2.0))
     np.testing.assert_array_equal(shifted(plan, 2), [*plan.controls[2:], plan.controls[-1], plan.controls[-1]])
 
 
-def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves(pushing):
+def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves():
     plan = pushing(Exact())
     assert plan.cost == plan.start_cost
     np.testing.assert_array_equal(plan.controls, 0)
@@ -177,7 +162,7 @@ def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves(pushi
     )
 
 
-def test_a_plan_is_the_rollout_of_its_controls(pushing):
+def test_a_plan_is_the_rollout_of_its_controls():
     plan = pushing(Sampled(0.3, 0.05, 30, "first"))
     state = plan.states[0]
     for control, expected in zip(plan.controls, plan.states[1:], strict=True):

@@ -39,18 +39,13 @@ def _positions(forces):
     return np.concatenate([[0], np.cumsum(H * velocity)])
 
 
-def test_states_before_each_step_and_after_the_last(roll, controls):
-    trajectory = roll(controls, jnp.zeros_like(controls))
-    np.testing.assert_allclose(trajectory.qpos[:, 0], _positions(controls[:, 0]), atol=1e-14)
-    np.testing.assert_allclose(trajectory.final.qpos, trajectory.qpos[-1])
-    assert trajectory.first_bad_step == -1
-
-
-def test_noise_is_added_to_the_controls(roll, controls):
+def test_states_before_each_step_and_after_the_last_are_those_of_controls_and_noise(roll, controls):
     noise = jnp.arange(6.0)[:, None]
     trajectory = roll(controls, noise)
     np.testing.assert_allclose(trajectory.ctrl, controls + noise)
     np.testing.assert_allclose(trajectory.qpos[:, 0], _positions((controls + noise)[:, 0]), atol=1e-14)
+    np.testing.assert_allclose(trajectory.final.qpos, trajectory.qpos[-1])
+    assert trajectory.first_bad_step == -1
 
 
 def test_a_policy_sees_the_present_state(scene):

@@ -61,11 +61,9 @@ def test_one_kernel_mends_what_the_operations_mend():
         hessian.in_one_kernel, max_shift=hessian._MAX_SHIFT, interpret=jax.default_backend() != "gpu"
     )
     found, _ = jax.jit(functools.partial(kernel, layout))(mass, jacobian, row_hessian, vector)
-    expected = jax.jit(lambda *args: hessian.solve_regularised(args[0], args[1], layout, args[2], args[3]))(
-        mass, jacobian, row_hessian, vector
-    )
-    unmended, _ = jax.jit(lambda *args: hessian.solve(args[0], args[1], layout, args[2], args[3]))(
-        mass, jacobian, row_hessian, vector
+    expected, (unmended, _) = (
+        jax.jit(solve, static_argnums=2)(mass, jacobian, layout, row_hessian, vector)
+        for solve in (hessian.solve_regularised, hessian.solve)
     )
     assert not np.isfinite(unmended[:, 0]).all()
     assert np.isfinite(expected).all()

@@ -1,7 +1,5 @@
 """Constraint rows as maps against their matrix, and that matrix against MJX's; the mass matrix as a map likewise."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,10 +42,10 @@ SCENE = """
 ROUNDING = 1e3 * np.finfo(float).eps
 
 
-@functools.cache
-def _rows(cone):
+@pytest.fixture(scope="module", params=["pyramidal", "elliptic"])
+def rows(request):
     """Return the model, MJX's data, and all rows of a state with contacts of every kind, as a map and as a matrix."""
-    mj_model = mujoco.MjModel.from_xml_string(SCENE.format(cone=cone))
+    mj_model = mujoco.MjModel.from_xml_string(SCENE.format(cone=request.param))
     mj_data = mujoco.MjData(mj_model)
     mj_data.joint("hip").qpos = -0.3
     mj_data.qvel[:] = np.random.default_rng(0).normal(size=mj_model.nv)
@@ -61,11 +59,6 @@ def _rows(cone):
 
     data, block, matrix = jax.jit(prepare)(mjx.put_data(mj_model, mj_data))
     return model, data, block, np.asarray(matrix)
-
-
-@pytest.fixture(params=["pyramidal", "elliptic"])
-def rows(request):
-    return _rows(request.param)
 
 
 @pytest.fixture

@@ -37,8 +37,7 @@ def test_the_force_between_two_geoms_is_cs(cone, condim, custom):
     scene = mg.load_scene(_SCENE.format(cone=cone, condim=condim, custom=custom))
 
     def look(model, data):
-        forces = (mg.contact_force(model, data, "floor", "box"), mg.contact_force(model, data, "ball", "floor"))
-        return jnp.stack(forces)
+        return jnp.stack([mg.contact_force(model, data, *names) for names in (("floor", "box"), ("ball", "floor"))])
 
     start = mg.initial_state(scene, qvel=_SLIDING)
     found = jax.jit(lambda: mg.rollout(scene, start, horizon=1, observe=look).observations[0])()

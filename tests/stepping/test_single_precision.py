@@ -4,6 +4,8 @@ Every pair of geoms, in poses that are symmetric but for a tilt that is smaller 
 limit, equality and sensor, at rest, at its reference and at its limit: both modes are finite, agree, and are right.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,6 +17,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.bodies import kinematics, spatial
 from mjxgrad.contact.collision import collide
 from mjxgrad.stepping import onset
+from tests.scenes import put
 
 _SHAPES = {
     "plane": 'type="plane" size="1 1 .1"',
@@ -48,25 +51,16 @@ def _poses():
     places = [[0, 0, 0.19], [0, 0, 0.5], [0.17, 0, 0], [0.1, 0.1, 0.19], [0, 0, 0]]
     half = np.sqrt(0.5)
     turns = [[1, 0, 0, 0], [half, half, 0, 0], [half, 0, half, 0], [np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0]]
-    found = []
-    for tilt in _TILTS:
-        for place in places:
-            for turn in turns:
-                change = np.array([1, 0.5 * tilt, 0, tilt])
-                found.append(np.concatenate([place, _product(change, np.array(turn))]))
+    found, turned = [], np.zeros(4)
+    for tilt, place, turn in itertools.product(_TILTS, places, turns):
+        mujoco.mju_mulQuat(turned, np.array([1, 0.5 * tilt, 0, tilt]), np.array(turn))
+        found.append([*place, *turned])
     return np.array(found)
-
-
-def _product(p, q):
-    result = np.zeros(4)
-    mujoco.mju_mulQuat(result, p, q)
-    return result
 
 
 def _contacts(pair):
     """Return a function of a motion of the body and its pose: all numbers of the contacts, weighted, and their depths' sum."""
-    model = mjx.put_model(mujoco.MjModel.from_xml_string(PAIR.format(*(_SHAPES[name] for name in pair))))
-    data = mjx.make_data(model)
+    model, data = put(PAIR.format(*(_SHAPES[name] for name in pair)))
 
     def contacts(motion, pose):
         quat = spatial.multiply(spatial.exponential(motion[3:]), pose[3:])
@@ -174,11 +168,10 @@ ZOO = """<mujoco><option timestep=".002" gravity="0 0 -9.81" tolerance="1e-12" i
     <motor joint="free" gear="1 0 0 0 .1 0"/>
 </actuator>
 {sensors}</mujoco>"""
-_INSIDE = (
-    '<spatial name="in_ring"><site site="upper"/><geom geom="ring" sidesite="inside"/><site site="lower"/></spatial>'
-)
-_PULLED = '<position tendon="in_ring" kp="3"/>'
-_SENSORS = """<sensor>
+_PARTS = {
+    "inside": '<spatial name="in_ring"><site site="upper"/><geom geom="ring" sidesite="inside"/><site site="lower"/></spatial>',
+    "pulled": '<position tendon="in_ring" kp="3"/>',
+    "sensors": """<sensor>
   <velocimeter site="bob"/><gyro site="bob"/><magnetometer site="bob"/>
   <camprojection site="bob" camera="eye"/><rangefinder site="down"/><rangefinder site="aside"/><rangefinder site="missing"/>
   <jointpos joint="hinge"/><jointvel joint="hinge"/><tendonpos tendon="string"/><tendonvel tendon="string"/>
@@ -190,12 +183,13 @@ _SENSORS = """<sensor>
     <frameangvel objtype="site" objname="bob"/>
   <subtreecom body="flyer"/><subtreelinvel body="flyer"/><subtreeangmom body="flyer"/><clock/>
 <touch site="touching"/><accelerometer site="bob"/><framelinacc objtype="site" objname="bob"/>
-<frameangacc objtype="site" objname="bob"/></sensor>"""
-# What needs rows.
-_HELD = """<body name="p" pos="0 2 1"><freejoint/><geom/></body><body name="q" pos=".2 2 1"><freejoint/>
-    <geom type="box" size=".05 .04 .03"/></body><body name="r" pos="0 3 1"><freejoint/><geom/></body>"""
-_EQUALITY = """<equality><weld body1="p" body2="q"/><connect body1="r" anchor="0 0 .1"/>
-    <joint joint1="drag" joint2="push" polycoef="0 .5 .3 0 0"/></equality>"""
+<frameangacc objtype="site" objname="bob"/></sensor>""",
+    # What needs rows.
+    "held": """<body name="p" pos="0 2 1"><freejoint/><geom/></body><body name="q" pos=".2 2 1"><freejoint/>
+    <geom type="box" size=".05 .04 .03"/></body><body name="r" pos="0 3 1"><freejoint/><geom/></body>""",
+    "equality": """<equality><weld body1="p" body2="q"/><connect body1="r" anchor="0 0 .1"/>
+    <joint joint1="drag" joint2="push" polycoef="0 .5 .3 0 0"/></equality>""",
+}
 
 
 def _states(model):
@@ -251,17 +245,8 @@ def _slopes_in_c(model, start, size):
 @pytest.mark.parametrize("is_all", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forces", "all"])
 def test_a_step_of_nearly_everything_has_both_derivatives(is_all):
     """Those of C MuJoCo's step, between the slopes on both sides where a limit or the end of a spring is just there."""
-    parts = {
-        "flag": "",
-        "held": _HELD,
-        "equality": _EQUALITY,
-        "inside": _INSIDE,
-        "pulled": _PULLED,
-        "sensors": _SENSORS,
-    }
-    without = dict.fromkeys(parts, "") | {"flag": '<flag constraint="disable"/>'}
-    text = ZOO.format(**parts if is_all else without)
-    model = mujoco.MjModel.from_xml_string(text)
+    parts = {"flag": "", **_PARTS} if is_all else {"flag": '<flag constraint="disable"/>', **dict.fromkeys(_PARTS, "")}
+    model = mujoco.MjModel.from_xml_string(ZOO.format(**parts))
     states, size = _states(model), 2 * model.nv + model.nu + model.na
     with jax.enable_x64(False):
         mjx_model, data = mjx.put_model(model), mjx.make_data(model)

@@ -5,7 +5,6 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from scipy import optimize
@@ -14,6 +13,7 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import SceneWarning
 from mjxgrad.stepping import smoothing_warnings
+from tests.scenes import put
 from tests.solver.test_smoothed_law import _nodes
 
 # A ball that can move up and sideways over a plane, and a slider with a limit; impedance rises with depth.
@@ -30,9 +30,7 @@ HEIGHT, SINK = 1e-3, -0.2  # m above the plane, m/s
 
 @functools.cache
 def _scene(cone="pyramidal", dim=1):
-    model = mujoco.MjModel.from_xml_string(SCENE.format(cone=cone, dim=dim))
-    put = mjx.put_model(model)
-    return put, mjx.make_data(put)
+    return put(SCENE.format(cone=cone, dim=dim))
 
 
 @eqx.filter_jit
@@ -180,9 +178,8 @@ BOX = """<mujoco><default><geom condim="1"/></default><worldbody>
 
 def test_what_has_no_force_at_a_distance_over_a_box_is_warned_of():
     """Of a capsule MJX says 1 m in place of 5 mm, within reach of the noise; a ball's distance is known from anywhere."""
-    model = mjx.put_model(mujoco.MjModel.from_xml_string(BOX))
-    smoothing = mg.Smoothing(5e-3)
-    pin, ball = eqx.filter_jit(mg.forward)(model, mjx.make_data(model), contact=smoothing).qacc
+    (model, data), smoothing = put(BOX), mg.Smoothing(5e-3)
+    pin, ball = eqx.filter_jit(mg.forward)(model, data, contact=smoothing).qacc
     assert abs(pin + 9.81) < 1e-12
     assert ball > -9.81 + 1
     (warning,) = smoothing_warnings(smoothing, model)

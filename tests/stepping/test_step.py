@@ -10,7 +10,7 @@ import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.stepping import assembly
-from tests.scenes import central_difference, published, zoo
+from tests.scenes import central_difference, published, put, zoo
 
 _SLOW = pytest.mark.slow
 _NAMES = ["hopper", "half_cheetah", "walker2d", "swimmer", "reacher", "inverted_double_pendulum", "ant"]
@@ -86,8 +86,8 @@ def test_solve_replaces_the_one_of_mjx():
     np.testing.assert_allclose(ours._impl.efc_force, ready._impl.efc_force, rtol=1e-5, atol=1e-5)
 
 
-def _directional(model, data, steps):
-    """Return a scalar function of a step along a random direction in state and controls."""
+def _check_directional(model, data, steps):
+    """Compare derivatives along a random direction in state and controls with central differences."""
     mjx_model, mjx_data = mjx.put_model(model), mjx.put_data(model, data)
     random = np.random.default_rng(3)
     turn, push = random.normal(size=(2, model.nv))
@@ -109,11 +109,6 @@ def _directional(model, data, steps):
         final, _ = jax.lax.scan(body, start, jnp.asarray(steer))
         return jnp.dot(jnp.concatenate(final[:2]), weight)
 
-    return outcome
-
-
-def _check_directional(model, data, steps):
-    outcome = _directional(model, data, steps)
     forward = jax.jit(lambda s: jax.jvp(outcome, (s,), (1.0,)))(0.0)[1]
     reverse = jax.jit(jax.grad(outcome))(0.0)
     widths = jnp.array([1e-6, 1e-7, 1e-8])
@@ -138,14 +133,9 @@ def test_derivative_through_all_kinds_of_rows_is_the_central_difference(cone, in
 
 _SLIDING = """<mujoco><option timestep=".004" tolerance="1e-13" iterations="100" cone="elliptic"/><worldbody>
   <geom type="plane" size="3 3 .1" friction=".5"/>
-  <body pos="0 0 .098"><joint type="slide" axis="1 0 0" damping=".2"/><joint type="slide" axis="0 0 1"/>
+  <body pos="0 0 .098"><joint name="push" type="slide" axis="1 0 0" damping=".2"/><joint type="slide" axis="0 0 1"/>
     <geom size=".1" mass="1" friction=".3" solref="-4000 -60"/></body></worldbody>
-  <actuator><motor joint="push"/></actuator></mujoco>""".replace('axis="1 0 0"', 'name="push" axis="1 0 0"')
-
-
-def _sliding():
-    model = mujoco.MjModel.from_xml_string(_SLIDING)
-    return mjx.put_model(model), mjx.make_data(model)
+  <actuator><motor joint="push"/></actuator></mujoco>"""
 
 
 @pytest.mark.parametrize(
@@ -160,7 +150,7 @@ def _sliding():
 )
 def test_parameters_of_the_model_have_their_derivative(field):
     """Along a scaling of the whole field; mass alone, not what MuJoCo precomputes from it (invweight)."""
-    model, data = _sliding()
+    model, data = put(_SLIDING)
     data = data.replace(qvel=jnp.array([1.0, 0.0]), ctrl=jnp.array([0.3]))
 
     def outcome(scale):
@@ -168,26 +158,24 @@ def test_parameters_of_the_model_have_their_derivative(field):
         for part in field.split("."):
             value = getattr(value, part)
         changed = model.tree_replace({field: value * scale})
-        final, _ = jax.lax.scan(lambda d, _: (_state(mg.step(changed, _full(data, d))), None), _state(data), length=20)
-        return jnp.dot(jnp.concatenate(final), jnp.array([1.0, -2.0, 0.5, 3.0, 0.0, 0.0]))
+
+        def step(_, state):
+            moved = mg.step(changed, data.replace(**state))
+            return {name: getattr(moved, name) for name in state}
+
+        start = {name: getattr(data, name) for name in ("qpos", "qvel", "qacc_warmstart")}
+        end = jax.lax.fori_loop(0, 20, step, start)
+        return jnp.dot(end["qpos"], jnp.array([1.0, -2.0])) + jnp.dot(end["qvel"], jnp.array([0.5, 3.0]))
 
     ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(outcome)))(jnp.array([1 + 1e-6, 1.0, 1 - 1e-6]))
     assert jnp.abs(slopes[1]) > 1e-6
     np.testing.assert_allclose(slopes[1], (ends[0] - ends[2]) / 2e-6, rtol=1e-5)
 
 
-def _state(data):
-    return data.qpos, data.qvel, data.qacc_warmstart
-
-
-def _full(data, state):
-    return data.replace(qpos=state[0], qvel=state[1], qacc_warmstart=state[2])
-
-
 @_SLOW
 def test_second_derivatives_nest():
     """Forward over reverse, and over forward, through a sliding contact, in velocity, mass and friction together."""
-    model, data = _sliding()
+    model, data = put(_SLIDING)
 
     def outcome(x):
         changed = model.replace(body_mass=model.body_mass * x[1], geom_friction=model.geom_friction * x[2])
@@ -205,7 +193,7 @@ def test_second_derivatives_nest():
 @_SLOW
 def test_a_batch_whose_members_choose_whether_to_step():
     """`jax.lax.cond` on a condition that differs, as of environments of which some are done, is a choice of either."""
-    model, data = _sliding()
+    model, data = put(_SLIDING)
     velocities = jnp.array([-0.5, -0.2, 0.1])
 
     def stepped(v):
