@@ -82,8 +82,9 @@ def gradient_audit(
             found[name, trace, limit] = window.seen, gradients.sound.shortened(limit)[0].first
         limited = other.sound.shortened(_LIMITS[-1])[0]
         references[name, trace] = frozen.direction(other_window.seen, limited.first)
-        found["zeroth", trace, math.inf] = window.seen, gradients.zeroth
-        references["zeroth", trace] = frozen.direction(other_window.seen, other.zeroth)
+        if name == "own":  # zeroth order has no derivative of a step
+            found["zeroth", trace, math.inf] = window.seen, gradients.zeroth
+            references["zeroth", trace] = frozen.direction(other_window.seen, other.zeroth)
     reference = jnp.stack([one / jnp.linalg.norm(one) for one in references.values()]).mean(axis=0)
     rise = jax.jit(frozen.rise)
     first = jax.tree.map(lambda x: x[:starts], states)

@@ -28,8 +28,8 @@ matrix of rank one per event, as saltation matrices are, so an event costs two m
   Small differences see that, and multiplied motions by 1e30 in fifty steps.
 - **Undecided.** A gap that no coordinate moves and that is zero to rounding (a robot that slides in a plane on the floor) opens
   and closes at random. Differences are then taken with margins by which it stays as it was in the step itself.
-- **Small differences** are of one side. Where a gap is smaller than they are, as at one step in a hundred while contacts chatter
-  by micrometres, they are taken a little farther off, also for "discrete" gradients. `mjd_transitionFD` crosses the surface
+- **Small differences** are of one side. Where a gap is smaller than they are, they are taken a little farther off, also for
+  "discrete" gradients. Contacts that chatter have such gaps at one step in a hundred. `mjd_transitionFD` crosses the surface
   there, and has entries of 1e5 in place of 1e2.
 - **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
   Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
