@@ -225,6 +225,7 @@ class _Worker:
     def __init__(self, engine: Engine):
         self.engine, self.data, self.places = engine, mujoco.MjData(engine.mj_model), engine.places
         self.given = self.model = engine.mj_model  # as given, and as differences take it
+        self.gradient = None
 
     @np.errstate(invalid="ignore", over="ignore")
     def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: list[int], found: dict) -> None:
@@ -239,7 +240,9 @@ class _Worker:
 
     def begin(self, gradient: Gradient, is_centred: bool = True) -> None:
         """Take a gradient for what follows."""
-        self.gradient, self.is_centred, self.near_to = gradient, is_centred, None
+        if gradient == "slope" or gradient != self.gradient:  # surfaces of states at rest serve all calls
+            self.near_to = None
+        self.gradient, self.is_centred = gradient, is_centred
 
     def use(self, models: list, index: int, speeds: Float[np.ndarray, "trajectories *steps nv"]) -> None:
         """Take the model of a trajectory for what follows; it is copied once for all that share it, and move so fast."""
@@ -338,17 +341,18 @@ class _Worker:
         self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
     ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
         """Return the model to take differences of, what is near, D, and the state about which differences cross no surface."""
-        near, nothing, is_slope = None, np.zeros((0, 0)), self.gradient == "slope"
+        near, nothing, shift, is_undecided = None, np.zeros((0, 0)), None, False
         if np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
-            if is_slope or self.surfaces.are_within(_WIDTH, self.far):
-                near = self.surfaces.near(self.far, row[self.places["qvel"]] * is_slope, after * is_slope)
-        if near is not None and near.is_undecided:
+            if self.gradient == "slope":
+                near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
+                is_undecided = near is not None and near.is_undecided
+            else:
+                shift, is_undecided = self.surfaces.beside(_WIDTH, self.far)
+        if is_undecided:
             model = min(undecided(model), key=lambda one: np.abs(self._step(one, row)[1] - after).max())
         if near is None or near.events is None:
-            return model, near if is_slope else None, nothing, row
-        if not is_slope:
-            return model, None, nothing, self._moved(model, row, near.events.clearance(_WIDTH))
+            return model, near, nothing, row if shift is None else self._moved(model, row, shift)
         spanned = self._spanned(model, row, events := near.events)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
             return model, dataclasses.replace(near, events=None), nothing, row

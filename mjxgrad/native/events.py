@@ -90,11 +90,7 @@ class Events:
 
     def clearance(self, change: float) -> Float[np.ndarray, " nv"]:
         """Return the displacement after which changes of this size cross no surface of the events."""
-        least, stages = 4 * change * np.abs(self.surfaces).max(axis=1), np.outer([0, 1, 2], self.centres)
-        off = self.gaps - stages
-        off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
-        shift = np.where(np.abs(off) < least, np.where(off < 0, -least, least) - off, 0.0)
-        return np.linalg.lstsq(self.surfaces, shift, rcond=1e-3)[0]
+        return _clearance(change, self.surfaces, self.gaps, self.centres)
 
 
 @dataclass(frozen=True)
@@ -144,11 +140,23 @@ class Surfaces:
         self.model = widened(model, self.contact_reach, self.limit_reach)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
-    def are_within(self, change: float, data: mujoco.MjData) -> bool:
-        """Return whether changes of this size may cross one at the position in `data`, for surfaces of states at rest."""
+    def beside(self, change: float, data: mujoco.MjData) -> tuple[Float[np.ndarray, " nv"] | None, bool]:
+        """Return what is asked of a state at rest: the displacement after which changes of this size cross no surface.
+
+        It is None where none is near; with it comes whether rounding decides if a contact or limit acts.
+        """
         mujoco.mj_fwdPosition(self.model, data)
-        gaps = data.efc_pos - data.efc_margin + self.contact_reach
-        return data.nefc > 0 and bool(np.abs(gaps).min() < 4 * change * self.longest)
+        # Most positions are far from all, which these few operations tell.
+        if (
+            not data.nefc
+            or np.abs(data.efc_pos - data.efc_margin + self.contact_reach).min() > 4 * change * self.longest
+        ):
+            return None, False
+        _, rows, gaps, least, jumps = self._gaps(data)
+        is_moved = self._moves(rows)
+        near = jumps & is_moved & (np.abs(gaps) < least)
+        is_undecided = bool((jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)).any())
+        return (_clearance(change, rows[near], gaps[near], 0.0) if near.any() else None), is_undecided
 
     def near(
         self, data: mujoco.MjData, before: Float[np.ndarray, " nv"], after: Float[np.ndarray, " nv"]
@@ -165,7 +173,7 @@ class Surfaces:
             centres, widths = -self.lead * rate, _STAGES * widths
         widths = np.maximum(widths, least)
         is_rough &= gaps - centres < widths
-        is_moved = np.linalg.norm(rows / self.lengths, axis=1) > 1 / _FARTHEST
+        is_moved = self._moves(rows)
         is_undecided = jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)
         jumps &= is_moved
         chosen = (np.abs(gaps - centres) < widths) & jumps
@@ -175,6 +183,10 @@ class Surfaces:
             events = _by_modes(rows, gaps, centres, widths, chosen, is_contact, self.lengths)
         others = jumps & ~chosen  # a force that begins without a jump may be crossed
         return Near(events, bool(is_rough.any()), bool(is_undecided.any()), rows[others], gaps[others], self.lengths)
+
+    def _moves(self, rows: _Rows) -> _Mask:
+        """Return which rows some coordinate moves."""
+        return np.linalg.norm(rows / self.lengths, axis=1) > 1 / _FARTHEST
 
     def _gaps(self, data: mujoco.MjData) -> tuple[_Mask, _Rows, _PerRow, _PerRow, _Mask]:
         """Return of contacts and limits whether they are rough, J, gap, least width, and whether force jumps."""
@@ -223,6 +235,18 @@ def widened(model: mujoco.MjModel, contact: float, limit: float) -> mujoco.MjMod
 def undecided(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """Return copies in which gaps of the size of rounding are closed, and open."""
     return widened(model, 2 * _ROUNDING, 2 * _ROUNDING), widened(model, -2 * _ROUNDING, -2 * _ROUNDING)
+
+
+def _clearance(
+    change: float, surfaces: Float[np.ndarray, "events nv"], gaps: _PerRow, centres: _PerRow | float
+) -> Float[np.ndarray, " nv"]:
+    """Return the smallest displacement after which changes of this size cross none of these surfaces."""
+    least, off = 4 * change * np.abs(surfaces).max(axis=1), gaps
+    if np.any(centres):
+        off = gaps - np.outer([0, 1, 2], centres)
+        off = np.take_along_axis(off, np.abs(off).argmin(axis=0)[None], axis=0)[0]
+    shift = np.where(np.abs(off) < least, np.where(off < 0, -least, least) - off, 0.0)
+    return np.linalg.lstsq(surfaces, shift, rcond=1e-3)[0]
 
 
 def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
