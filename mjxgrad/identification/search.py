@@ -223,11 +223,9 @@ class _Program:
 
         return jax.vmap(one)(windows, offsets)
 
-    def _sums(self, windows: Windows, vectors: Array) -> Float[Array, " points"]:
-        """Return for each vector the sum of squares over all windows."""
-        return self._over_windows(lambda residual: jnp.sum(residual**2), windows, vectors)
-
     def _over_windows(self, loss: Callable, windows: Windows, vectors: Array) -> Float[Array, " points"]:
+        """Return for each vector the loss of the residuals of all windows."""
+
         def of_one(vector: Array) -> Array:
             return loss(jax.vmap(lambda window: self._residuals(vector, None, window))(windows))
 
@@ -252,9 +250,8 @@ class _Program:
         """Return the best of many points between the bounds, by differential evolution of a loss of the residuals.
 
         Hard contacts chatter: each switch of a contact makes the later motion jump, and the sum of squares has a minimum in
-        every cell between two jumps. Descent ends in the first of them. After some jumps two motions have nothing in common,
-        and their squares drown what still tells. A robust loss counts the numbers that fit instead, such as all before the
-        first jump.
+        every cell between two jumps. After some of them two motions have nothing in common, and their squares drown what
+        still tells. A robust loss counts the numbers that fit, such as all before the first jump.
         """
         dtype, losses = self.coordinates.nominal.dtype, functools.partial(self._over_windows, loss)
         low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
@@ -288,7 +285,8 @@ class _Program:
         if not held_out:
             return None
         judged, vectors = stack(self.nominal, held_out), jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
-        sums = compile_once(jax.jit(self._sums).lower(judged, vectors))(judged, vectors)
+        squared = functools.partial(self._over_windows, lambda residual: jnp.sum(residual**2))
+        sums = compile_once(jax.jit(squared).lower(judged, vectors))(judged, vectors)
         first, last = np.sqrt(np.asarray(sums, float) / _num_numbers(judged))
         return float(first), float(last)
 

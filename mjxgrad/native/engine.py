@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._warnings import collected
-from mjxgrad.native.events import Events, Near, Surfaces, levers_of, undecided
+from mjxgrad.native.events import Events, Near, Surfaces, clearance, levers_of, undecided
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
 
@@ -356,7 +356,7 @@ class _Worker:
         spanned = self._spanned(model, row, events := near.events)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
             return model, dataclasses.replace(near, events=None), nothing, row
-        clear = self._moved(model, row, events.clearance(_WIDTH))
+        clear = self._moved(model, row, clearance(_WIDTH, events.surfaces, events.gaps, events.centres))
         if self.surfaces.lead:
             for move, rates in zip(events.moves.T, events.rows, strict=True):
                 clear = self._off_stages(model, clear, _WIDTH * np.abs(rates).max() * move)

@@ -88,10 +88,6 @@ class Events:
     gaps: Float[np.ndarray, " events"]
     centres: Float[np.ndarray, " events"]
 
-    def clearance(self, change: float) -> Float[np.ndarray, " nv"]:
-        """Return the displacement after which changes of this size cross no surface of the events."""
-        return _clearance(change, self.surfaces, self.gaps, self.centres)
-
 
 @dataclass(frozen=True)
 class Near:
@@ -141,10 +137,7 @@ class Surfaces:
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
     def beside(self, change: float, data: mujoco.MjData) -> tuple[Float[np.ndarray, " nv"] | None, bool]:
-        """Return what is asked of a state at rest: the displacement after which changes of this size cross no surface.
-
-        It is None where none is near; with it comes whether rounding decides if a contact or limit acts.
-        """
+        """Return the displacement after which changes of this size cross no surface, or None, and whether rounding decides."""
         mujoco.mj_fwdPosition(self.model, data)
         # Most positions are far from all, which these few operations tell.
         if (
@@ -156,7 +149,7 @@ class Surfaces:
         is_moved = self._moves(rows)
         near = jumps & is_moved & (np.abs(gaps) < least)
         is_undecided = bool((jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)).any())
-        return (_clearance(change, rows[near], gaps[near], 0.0) if near.any() else None), is_undecided
+        return (clearance(change, rows[near], gaps[near], 0.0) if near.any() else None), is_undecided
 
     def near(
         self, data: mujoco.MjData, before: Float[np.ndarray, " nv"], after: Float[np.ndarray, " nv"]
@@ -237,7 +230,7 @@ def undecided(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     return widened(model, 2 * _ROUNDING, 2 * _ROUNDING), widened(model, -2 * _ROUNDING, -2 * _ROUNDING)
 
 
-def _clearance(
+def clearance(
     change: float, surfaces: Float[np.ndarray, "events nv"], gaps: _PerRow, centres: _PerRow | float
 ) -> Float[np.ndarray, " nv"]:
     """Return the smallest displacement after which changes of this size cross none of these surfaces."""
