@@ -78,8 +78,7 @@ class Verdict(Printed):
             lines.append(textwrap.fill(finding.text, _WIDTH, initial_indent=lead, subsequent_indent="  "))
         return "\n\n".join(["\n".join(lines), textwrap.indent(self.code, "    ").rstrip(), *self._details().values()])
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def _details(self) -> dict[str, str]:
         """Return the detailed report: measurements, scene, time step."""

@@ -1,18 +1,15 @@
 r"""Contacts of two boxes, where C MuJoCo 3.17 has them: up to eight where faces touch, one where edges cross.
 
-**Which axis.** Boxes overlap unless an axis separates them: a face normal of either, or an edge of one across an edge of the
-other. Along a unit axis $n$ their separation is $|n·p| - \sum_i h_i |n·a_i|$, with $p$ between the centres. The six axes of both
-boxes are $a_i$, and $h_i$ is half their length (m). The axis with the largest separation is the contact's normal. Edges have to
-be better than faces by a millionth of the separation, and by 5 % if they differ by less than 8° from the best face. Parallel
-edges have no axis.
-
-**Faces.** The box with that normal clips the face of the other box that looks most against it. The corners of what is left are
-the contacts. Each lies half way between both surfaces along the normal, and its distance is their distance there.
-
-**Edges.** The contact is in the middle between the nearest points of both edges, and its distance is along the normal.
-
-**Derivatives** are those of these formulas in the branch taken. An edge nearly parallel to a side of the clipping face cuts it
-anywhere: the place of such a cut on its edge is a constant to the derivative.
+- **Which axis.** Boxes overlap unless an axis separates them: a face normal of either, or an edge of one across an edge of the
+  other. Along a unit axis $n$ their separation is $|n·p| - \sum_i h_i |n·a_i|$, with $p$ between the centres. The six axes of
+  both boxes are $a_i$, and $h_i$ is half their length (m). The axis with the largest separation is the contact's normal. Edges
+  have to be better than faces by a millionth of the separation, and by 5 % if they differ by less than 8° from the best face.
+  Parallel edges have no axis.
+- **Faces.** The box with that normal clips the face of the other box that looks most against it. The corners of what is left are
+  the contacts. Each lies half way between both surfaces along the normal, and its distance is their distance there.
+- **Edges.** The contact is in the middle between the nearest points of both edges, and its distance is along the normal.
+- **Derivatives** are those of these formulas in the branch taken. An edge nearly parallel to a side of the clipping face cuts it
+  anywhere: the place of such a cut on its edge is a constant to the derivative.
 
 References:
     Gottschalk, Lin, Manocha. OBBTree: a hierarchical structure for rapid interference detection. SIGGRAPH 1996.

@@ -2,20 +2,16 @@
 
 Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`. Five more kinds of pair differ from MJX.
 
-A box on a plane. MJX takes corners within 1 mm of the deepest one, and loses others that still touch. C MuJoCo and this library
-take the lower end of each of the four diagonals, so a contact always belongs to the same diagonal.
-
-Two faces, one of them of a mesh. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
-For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.
-
-A ball on a box. MJX knows the distance only where they overlap; the nearest point of a box is known everywhere.
-
-A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder has a closed form.
-
-A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and derives the height of the other two
-from it. An upright cylinder has no lowest point: MJX picks a fixed one, and the heights of the other two do not depend on a tilt
-about it. Their positions do: each lies half its distance from the rim towards the plane. So n·(p - o) + d/2 is the height of
-the rim above the plane, and its derivative is correct in every pose.
+- A box on a plane. MJX takes corners within 1 mm of the deepest one, and loses others that still touch. C MuJoCo and this
+  library take the lower end of each of the four diagonals, so a contact always belongs to the same diagonal.
+- Two faces, one of them of a mesh. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
+  For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.
+- A ball on a box. MJX knows the distance only where they overlap; the nearest point of a box is known everywhere.
+- A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder has a closed form.
+- A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and derives the height of the other
+  two from it. An upright cylinder has no lowest point: MJX picks a fixed one, and the heights of the other two do not depend on
+  a tilt about it. Their positions do: each lies half its distance from the rim towards the plane. So n·(p - o) + d/2 is the
+  height of the rim above the plane, and its derivative is correct in every pose.
 """
 
 import sys

@@ -5,8 +5,7 @@ is the share of it that is realised: $d_0$ at $r = 0$, $d_w$ from the width on. 
 impedance.
 
 Under a force that would give its bodies the acceleration $a_0$ towards each other, a contact at rest has
-$K d(\rho)^2 \rho / (1 - d(\rho)) = c\,a_0$, with $\rho$ the depth below the distance at which it begins and
-$K = k / d_w^2$.
+$K d(\rho)^2 \rho / (1 - d(\rho)) = c\,a_0$, with $\rho$ the depth below the distance at which it begins and $K = k / d_w^2$.
 The factor $c$ is 1 for frictionless contacts and elliptic cones. A pyramid's normal force is the sum over its edges, whose
 regularisation MuJoCo scales with friction: $c = \mu^2 (1 + \mu^2) / ((n - 1)\,\text{impratio})$, $n$ the dimension of
 the contact. With the default impratio of 1, $c = 1$ at $\mu = 1$, $n = 3$.

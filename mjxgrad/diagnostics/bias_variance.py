@@ -232,8 +232,7 @@ class BiasVariance(eqx.Module, Printed):
         """Write the table for a terminal; labels name the softnesses in place of their numbers."""
         return "\n".join([*aligned(self.rows(labels), str.ljust), "", *self.notes()])
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def plot(self) -> Any:
         """Draw bias and variance against softness by matplotlib, one column per point, and return the figure."""

@@ -193,8 +193,7 @@ class StabilityReport(Printed):
             lines + [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
         )
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def _rows(self) -> Iterator[tuple[str, ...]]:
         groups: dict[tuple[str, ...], list[Spring]] = {}

@@ -6,9 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from mjxgrad._arrays import is_known
+from mjxgrad._text import Printed, format_number
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan
 from mjxgrad.objective.base import Scalar, Vector
@@ -38,7 +42,7 @@ class Reason(eqx.Enumeration):
     )
 
 
-class GradientEstimate(eqx.Module):
+class GradientEstimate(eqx.Module, Printed):
     r"""An estimate of $\nabla F(\theta)$ with its errors and the rollouts spent on it.
 
     Errors account for the dependence of samples through a leave-one-out baseline and through antithetic pairs.
@@ -74,6 +78,20 @@ class GradientEstimate(eqx.Module):
     alpha: Scalar
     reason: Reason
     bias_bound: Scalar
+
+    def __str__(self) -> str:
+        if not is_known(self.num_samples) or jnp.ndim(self.num_samples):
+            return repr(self)
+        parts = [np.asarray(ravel_pytree(part)[0]) for part in (self.value, self.standard_error)]
+        if is_long := (size := parts[0].size) > 6:
+            parts = [np.array([np.linalg.norm(part)]) for part in parts]
+        pairs = [*zip(*parts, strict=True), (self.objective_mean, self.objective_standard_error)]
+        *shown, cost = (f"{format_number(float(x))} ± {format_number(float(error))}" for x, error in pairs)
+        head = f"of {size} numbers, of norm {shown[0]}" if is_long else ", ".join(shown)
+        end = (
+            f"{Diagnosis[self.diagnosis]}. α is {float(self.alpha):.3g}: {Reason[self.reason]}. ± is a standard error."
+        )
+        return f"Gradient {head}; cost {cost}; {int(self.num_rollouts)} rollouts: {end}"
 
     @property
     def variance(self) -> Float[Array, "*batch"]:

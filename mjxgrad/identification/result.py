@@ -127,8 +127,7 @@ class Identification(Printed):
         warnings = [f"\n{line}" for line in self.warnings()]
         return "\n".join([f"{head}, {self.stopped.value}.", f"{rms}.", "", *aligned(self.rows()), *warnings])
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return the values as a table of text, header first: name and unit, value, interval, start, bounds."""

@@ -16,9 +16,8 @@ terms, of which the second vanishes in the middle and both at the top,
 
     ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)).
 
-Noise shifts N by μcw, so each term is the simple one with a spread of its own. At T = 0 their tangential forces cancel.
-
-Arrays may carry the batch as trailing axes, see `linear`.
+Noise shifts N by μcw, so each term is the simple one with a spread of its own. At T = 0 their tangential forces cancel. Arrays
+may carry the batch as trailing axes, see `linear`.
 
 References:
     Todorov. Convex and analytically-invertible dynamics with contacts and constraints: Theory and implementation in

@@ -16,9 +16,8 @@ state and parameters, for contacts, joint and tendon limits, all cones, at onset
 
 1. The mean of the plain derivative over any interval is the difference of the outcome. No saltation term is needed, and no
    assumption on order, speed or duration of contacts.
-2. The ramp is centred at r = 0, where MuJoCo switches, so over the phase of a step the mean motion is MuJoCo's. Only the sawtooth
-   is lost, an error of the time step. φ = 1 is MuJoCo's contact, φ = 0 is none. Bodies that rest, slide or stick deeper
-   than w / 2 have φ = 1.
+2. The ramp is centred at r = 0, where MuJoCo switches, so over the phase of a step the mean motion is MuJoCo's, and only the
+   sawtooth is lost. φ = 1 is MuJoCo's contact, that of bodies that rest, slide or stick deeper than w / 2; φ = 0 is none.
 
 **Several at once.** The integral needs one solve for each of its pieces. Two are taken for any number of partial contacts,
 
@@ -30,12 +29,11 @@ partial, or all have the same φ, this is the integral. Otherwise a contact with
 **Slow contacts.** The derivative by r is 1 / w, so where contacts graze or chatter w has a floor, w ≥ √(h²u² + w₀²):
 
 - Grazing: u = max(g h, g / 2(B + √K)). Below u free motion, or the weight on the contact, moves the bodies faster than they
-  approach. The edges n ± μ t of a sliding pyramid act with B μ |v_t| on touch, often many times the weight, and the body
-  then rides on the ramp. So u grows by three times the speed that this force gains in a step, unless the approach is much faster
-  than 2 g h: an impact.
-- Motors: a light foot pressed down with many times its weight is stopped and released within a few steps. Each time its tangent
-  grows by about h Δa / u. So u gets a term of the same form for three times |J a| - g, with a the unconstrained acceleration. It
-  adds at most 10 of the impedance's widths to w, and is zero for bodies that only fall or roll.
+  approach. The edges n ± μ t of a sliding pyramid act with B μ |v_t| on touch, often many times the weight, so u grows by three
+  times the speed that this force gains in a step, unless the approach is much faster than 2 g h: an impact.
+- Motors: a light foot pressed down with many times its weight is stopped and released within a few steps, and each time its
+  tangent grows by about h Δa / u. So u gets such a term for three times |J a| - g, with a the unconstrained acceleration. It adds
+  at most 10 of the impedance's widths to w, and is zero for bodies that only fall or roll.
 - Chatter: w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Where contacts chatter (a body pushed along the
   floor) each switch multiplies the tangent by about h Δa / w, which w₀ bounds. A larger w₀ gives a smoother motion, farther
   from MuJoCo's. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, are not widened by it.
@@ -47,11 +45,10 @@ a right angle where another face of a box becomes the nearest to a ball's centre
 ψ = min(1, 1/2 + δ / w) of the step, the other side for the rest. Here δ is how much nearer the present side is, and w is how
 much δ changes in a step. This covers geoms with a centre of symmetry, and balls in boxes.
 
-**Limits.** True discontinuities remain: hit or miss, an edge that catches or not. So do jumps where two boxes change their
-touching faces, and where three faces of a box are equally near within a step. A contact shorter than about three steps is smooth
-but not resolved. Chatter still multiplies tangents, within the bound of the width. The distance of boxes and meshes is known only
-where they overlap, except from planes, and between boxes and balls. Without a distance the ramp lies at 0 > r > -w: continuous,
-but half a step late.
+**Limits.** True discontinuities remain: hit or miss, an edge that catches, boxes that change their touching faces, three faces of
+a box equally near. A contact shorter than about three steps is smooth but not resolved. Chatter multiplies tangents, within the
+bound of the width. The distance of boxes and meshes is known only where they overlap, except from planes, and between boxes and
+balls. Without a distance the ramp lies at 0 > r > -w: continuous, but half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.

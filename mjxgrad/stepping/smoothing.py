@@ -19,9 +19,8 @@ stays convex, and the same solve finds the acceleration. The rows need two numbe
 and gate = c r. The edges of a pyramid share their noise. For cones see `constraint`.
 
 The weight D and c also depend on depth, through the impedance. They are taken at one depth, the mean of -(r + w) given that it
-is positive. For bodies in contact this tends to their depth as the length goes to zero. For separate bodies it is the mean
-penetration when noise makes them touch. (At the mean distance itself, contacts whose impedance begins at zero would have no
-force at a distance.)
+is positive: bodies in contact have their depth for short lengths, others the mean penetration when noise makes them touch.
+(At the mean distance itself, contacts whose impedance begins at zero would have no force at a distance.)
 
 MJX knows the distance of boxes, meshes and height fields only where they overlap, and reports 1 or more elsewhere: such
 slots have no rows.

@@ -48,6 +48,18 @@ def test_an_estimate_has_the_form_of_the_parameters(key, name, form):
         np.testing.assert_allclose(leaves(found), getattr(vector, field), rtol=1e-10)
     np.testing.assert_allclose(tree.variance, vector.variance, rtol=1e-10)
     assert eqx.apply_updates(FORMS[form], tree.value) is not None
+    assert str(tree) == str(vector)
+
+
+def test_an_estimate_is_printed_in_numbers_and_a_long_one_by_its_norm(key):
+    """Of a cost 3 x by exact first order; of 16 such the norm is 12. A traced one has no numbers."""
+    slope = parameter_noise(lambda x: 3 * x.sum(), 0.1)
+    one, many = (estimators.first_order(slope, jnp.zeros(size), key, num_samples=4) for size in (1, 16))
+    assert str(one).startswith("Gradient 3 ± 0; cost ")
+    assert str(many).startswith("Gradient of 16 numbers, of norm 12 ± 0; cost ")
+    assert str(one).endswith("; 4 rollouts: every sample was finite. α is 1: the estimator leaves no choice, or α was "
+        "given. ± is a standard error.")  # fmt: skip
+    jax.jit(lambda x: str(estimators.first_order(slope, x, key, num_samples=4)) and x)(jnp.zeros(1))
 
 
 def test_both_orders_have_the_form_and_a_batch_keeps_its_variances_apart(key):
