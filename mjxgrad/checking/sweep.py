@@ -99,8 +99,7 @@ class Knob:
     """A task's cost under noise, as a function of its contact stiffness and of one number.
 
     The number shifts all controls along one direction, and every control has noise at each step; both are in halves of the
-    control ranges. Without actuators both act on the initial velocities, in m/s or rad/s. The direction is random where there
-    are several.
+    control ranges. Without actuators both act on the initial velocities, in m/s or rad/s. Of several, the direction is random.
     """
 
     task: SceneTask

@@ -137,8 +137,7 @@ def _clipped(
 ) -> tuple[Float[Array, "12 3"], Bool[Array, "12"]]:
     """Return corners of a parallelogram clipped by an upright rectangle, and which of them there are.
 
-    They are on the parallelogram's four edges, where each begins or enters and where it leaves, and at the four corners of the
-    rectangle.
+    They are on the parallelogram's four edges, where each begins or enters and where it leaves, and at the rectangle's corners.
     """
     slack = 16 * jnp.finfo(half.dtype).eps
     corners = jnp.asarray(_CORNERS, half.dtype)

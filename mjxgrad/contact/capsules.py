@@ -1,8 +1,7 @@
 """Contacts of planes, balls and capsules; a ball is a capsule of length zero.
 
 All pairs with a plane share one formula, and all others another: forty pairs of a robot take as many operations as one.
-Distances, positions and normals agree with C MuJoCo. Tangents agree with MJX, but are at right angles to the normal on
-tilted planes, too.
+Distances, positions and normals agree with C MuJoCo. Tangents agree with MJX, but are normal to tilted planes, too.
 
 Nearest points of two segments, with unit axes a₁ and a₂ and centres r apart: the first line is nearest to the second at
 s = (a₂·r a₁·a₂ - a₁·r) / (1 - (a₁·a₂)²), and t = a₂·r + s a₁·a₂ is the point of the second line nearest to s. s is clamped

@@ -1,8 +1,7 @@
 r"""The law of a contact or limit: stiffness, damping, impedance, and depth at rest.
 
 A row with violation $r$ and rate $v$ has the reference acceleration $a_\text{ref} = -B v - K d(r) r$. The impedance $d(r)$
-is the share of it that is realised: $d_0$ at $r = 0$, $d_w$ from the width on. `solref` gives $K$ and $B$, `solimp` the
-impedance.
+is the share of it that is realised: $d_0$ at $r = 0$, $d_w$ from the width on. `solref` gives $K$ and $B$, `solimp` $d$.
 
 Under a force that would give its bodies the acceleration $a_0$ towards each other, a contact at rest has
 $K d(\rho)^2 \rho / (1 - d(\rho)) = c\,a_0$, with $\rho$ the depth below the distance at which it begins and $K = k / d_w^2$.

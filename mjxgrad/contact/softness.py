@@ -55,8 +55,7 @@ class Softness(eqx.Module):
     sinks $(n - 1)(m + \rho_0)$ deeper, and impacts go deeper, too.
 
     A part that is `None` stays as it is in the model. If only one of stiffness and damping ratio is given, the other keeps its
-    present effective value. Every part is a leaf of a pytree, so that a sweep is one `jax.vmap` over a `Softness` with a
-    leading axis.
+    present effective value. Every part is a leaf of a pytree, so that a sweep is one `jax.vmap` with a leading axis.
 
     Attributes:
         stiffness: $k = \omega_0^2$, in 1/s²; positive. With `rest_acceleration` it is the stiffness without margin.

@@ -75,8 +75,7 @@ class Planar(Environment):
     """A body in a plane that is to run along x: hopper and cheetah.
 
     Attributes:
-        fallen: change of the torso's height below which the episode is over (m). With None it is never over, and height and
-            tilt are not rewarded.
+        fallen: change of the torso's height below which the episode is over (m). None: never, and posture has no reward.
     """
 
     fallen: float | None = eqx.field(static=True, default=None, kw_only=True)

@@ -112,7 +112,7 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
     noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
     at = times - times[0]
     driven = {"controls": controls, "control_times": at} if scene.model.nu else {}
-    made = Recording(found, times=at, noise=noise, name=str(path), **driven)
+    made = Recording(found, times=at, noise=noise, knows_noise=False, name=str(path), **driven)
     return dataclasses.replace(made, start=start_of(scene, made, at)), tuple(unknown)
 
 

@@ -25,14 +25,13 @@ class Recording:
     """A measured motion.
 
     Attributes:
-        measured: measurements by sensor name, or as "qpos", "qvel" or "act": one row per time. NaN where there is no
-            measurement.
+        measured: measurements by sensor name, or as "qpos", "qvel" or "act": one row per time, NaN for none.
         controls: the controls, one row per time step of the scene or per entry of `control_times`; None for none.
-        times: times of the measurements from the start (s), increasing; None for one at each state, the first and last
-            included.
+        times: times of the measurements from the start (s), increasing; None for one at each state.
         control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
             (m, rad). The default is 1. Ratios weigh the signals; the overall size is estimated.
+        knows_noise: whether `noise` is that of the measurements; otherwise it only weighs the signals.
         start: the state at time 0; None for what was measured then, else the scene's pose, at rest.
         name: name in messages.
     """
@@ -42,6 +41,7 @@ class Recording:
     times: Any = None
     control_times: Any = None
     noise: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    knows_noise: bool = True
     start: State | None = None
     name: str = "the recording"
 
@@ -98,7 +98,9 @@ class Recording:
             start, name = times[rows[0]], f"{self.name} from {times[rows[0]]:g} s"
             kept = np.zeros(0, bool) if at is None else at - start > -timestep / 2
             given = (None, None) if at is None else (np.asarray(controls)[kept], np.maximum(at[kept] - start, 0))
-            windows.append(Recording(measured, given[0], times[rows] - start, given[1], self.noise, name=name))
+            windows.append(
+                Recording(measured, given[0], times[rows] - start, given[1], self.noise, self.knows_noise, name=name)
+            )
         return windows
 
 

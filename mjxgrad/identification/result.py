@@ -1,8 +1,7 @@
 r"""The identified values, their intervals, and the parameters that the recordings leave undetermined.
 
 Let $r$ be the residuals in units of the noise, $J = \partial r / \partial \theta$ at the end, $n$ numbers and $p$ unknowns.
-Then $s^2 = r^T r / (n - p)$ estimates the ratio of the true to the stated noise variance, and the covariance of the
-parameters is
+Then $s^2 = r^T r / (n - p)$ estimates the ratio of the true to the stated noise variance, and the parameters' covariance is
 $s^2 (J^T J)^{-1}$. This assumes a correct model, independent noise, and nearly linear residuals over the interval.
 Directions without effect have no interval; they are named. A singular value decomposition of $J$ with columns of length 1
 finds them.
@@ -32,6 +31,7 @@ _NOT_TOLD_APART = 1e-6  # of the largest singular value: the data would have to 
 _RELATED = 0.5  # correlation of residuals that makes intervals too narrow by √3
 _REMOVED = 1e-3  # of the residuals at the start: less comes from numerical differences
 _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred times
+_BETTER = 0.8  # of the first residuals
 _CHANCE = 1e-4  # probability that residuals as large are noise
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
 
@@ -55,18 +55,16 @@ class Identification(Printed):
         half_width: half-widths of the 95 % intervals, by name; infinite where the recordings determine nothing.
         covariance: covariance of all numbers in the order of `names`; infinite on the diagonal where they are not determined.
         names: one name per number, `gains[1]` within an array.
-        condition_number: condition number of J with columns of length 1. Beyond a hundred or so, single intervals are much
-            wider than those of combinations.
+        condition_number: condition of J with columns of length 1. Beyond a hundred, combinations have narrower intervals.
         without_effect: names on which no measurement depends.
         inseparable: combinations without effect on any measurement, as joint changes relative to the values.
-        at_bounds: names that ended at a bound: the data ask for more, and their intervals mean little.
+        at_bounds: names that ended at a bound, whose intervals mean little.
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         has_noise: whether the recordings state the noise of every signal.
         held_out_rms: the same for the held-out recordings; None without any.
         offsets: changes of the starts; None unless asked for.
-        correlation: correlation of successive residuals of a signal. About 0 if only independent noise is left.
-        removable: share of the sum of squares that the linear model at the end could still remove within the bounds. About 0
-            at a minimum of a smooth motion.
+        correlation: correlation of successive residuals of a signal, about 0 if only independent noise is left.
+        removable: share of the sum of squares that the linear model at the end could still remove; 0 at a smooth minimum.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
         stopped: the reason why the search ended.
@@ -99,8 +97,15 @@ class Identification(Printed):
 
     @property
     def is_sound(self) -> bool:
-        """Whether the search converged and determined every number."""
-        return self.stopped is Stopped.CONVERGED and not (self.without_effect or self.inseparable or self.at_bounds)
+        """Whether the search converged, determined every number, and explained the recordings."""
+        is_determined = not (self.without_effect or self.inseparable or self.at_bounds)
+        return self.stopped is Stopped.CONVERGED and is_determined and not self._is_unexplained
+
+    @property
+    def _is_unexplained(self) -> bool:
+        if self.has_noise:
+            return exceeds_noise(self.rms[1], self.num_numbers - len(self.names))
+        return any(after > _BETTER * before for before, after in (self.rms, self.held_out_rms or (1, 0)))
 
     @property
     def headline(self) -> str:
@@ -113,7 +118,11 @@ class Identification(Printed):
         found = f"{count - lost} of {count} numbers found" if lost else f"All {count} found" if count > 1 else "Found"
         if self.at_bounds and not lost:
             found = f"{len(self.at_bounds)} of {count} numbers ended at a bound"
+        if self._is_unexplained:
+            found = "Not found, for more than noise is left"
         rms, which = (self.rms, "error") if self.held_out_rms is None else (self.held_out_rms, "held-out error")
+        if self.has_noise:
+            return f"{found}: {which} {rms[1]:.3g} times the noise, {rms[0]:.3g} before."
         before, after = (f"{100 * one:.2g} %" if one < 0.995 else f"{100 * one:.0f} %" for one in rms)
         return f"{found}: {which} {after} of the motion, {before} before."
 
@@ -121,7 +130,8 @@ class Identification(Printed):
         """Describe the result in text: the values with their intervals, then the warnings."""
         count = len(self.names)
         head = f"{count} number{'s' * (count > 1)} from {self.num_numbers} measured ones in {self.num_steps} steps"
-        rms = f"Residuals, in units of the noise: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
+        unit = "units of the noise" if self.has_noise else "the given scales"
+        rms = f"Residuals, in {unit}: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
         if self.held_out_rms is not None:
             rms += f"; held out: {self.held_out_rms[0]:.3g} and {self.held_out_rms[1]:.3g}"
         warnings = [f"\n{line}" for line in self.warnings()]
@@ -150,7 +160,7 @@ class Identification(Printed):
                 f"Stalled: the linear model would remove {100 * self.removable:.2g} % of the sum of squares, but no step helps. "
                 "Jumps in the motion cause this: take contact=mg.Onset(), shorter windows or another start; doubt the intervals."
             )
-        if self.has_noise and exceeds_noise(self.rms[1], self.num_numbers - len(self.names)):
+        if self.has_noise and self._is_unexplained:
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "

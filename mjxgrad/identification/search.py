@@ -2,8 +2,7 @@ r"""The search: residuals of all recordings in one program, their derivative in 
 
 One program rolls out all windows of a scene under `jax.vmap`, with one tangent per parameter. The unknown start of a window
 affects that window alone, so the tangents of the starts do not grow with the number of windows. Each step of the search asks
-this program for residuals and derivative at one point. From their linear model optimistix accepts or refuses the point and
-chooses the next.
+this program for residuals and derivative at one point, and optimistix chooses the next by their linear model.
 """
 
 import contextlib
@@ -41,7 +40,7 @@ _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
 _NUM_POINTS, _NUM_GENERATIONS = 256, 60  # of the search between the bounds
 # Scale of the robust loss, of the noise: of 12 boxes that turn it finds all with 0.3, 10 with 1 or 0.1 and 5 with 10.
 _SHARE = 0.3
-_OVERSTATED = 0.5  # noise that is twice as large as the residuals tells nothing
+_LEFT = 0.3  # of the first residuals
 _MISFIT = 10.0  # by which residuals that no descent lowers exceed the noise, where it is not known
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
 _DIVERGED = 1e30  # loss of a diverged motion
@@ -69,8 +68,7 @@ def identify(
 
     Args:
         scene: the scene with nominal values.
-        parameters: parameters by name, from `mass`, `friction`, `softness` and the like, or a `Parameter` with its
-            own `write`.
+        parameters: parameters by name, from `mass`, `friction`, `softness` and the like, or a `Parameter` of your own.
         recordings: recordings of the scene.
         held_out: recordings for validation only.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
@@ -111,25 +109,25 @@ def identify(
     program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
     start = program.start()
     end = _descend(program, start, max_steps, log)
-    has_noise = all(set(one.noise) == set(one.measured) for one in recordings)
+    has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
     if _is_off(program, end, has_noise) and not free_start and end.stopped is not Stopped.INTERRUPTED:
-        noise = min(_rms(program, end.found) / _MISFIT, 1.0 if has_noise else math.inf)
+        noise = 1.0 if has_noise else _rms(program, end.found) / _MISFIT
         loss, again = functools.partial(_robust, scale=_SHARE * noise), end._replace(stopped=Stopped.INTERRUPTED)
         with contextlib.suppress(KeyboardInterrupt):
             again = _descend(program, program.searched(loss), max_steps, log)
         end = end._replace(stopped=again.stopped if again.stopped is Stopped.INTERRUPTED else end.stopped)
         if loss(again.found[0]) < loss(end.found[0]):
-            end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps)
+            end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps, is_searched=True)
     return _identified(program, end, held_out, has_noise)
 
 
 def _is_off(program: "_Program", end: "_End", has_noise: bool) -> bool:
-    """Return whether a descent left more than noise; if that is not known, whether its linear model would remove much more."""
+    """Return whether a descent left more than noise; if that is not known, whether it stalled or explained little."""
     after = _rms(program, end.found)
-    if has_noise and after > _OVERSTATED:
+    if has_noise:
         return exceeds_noise(after, program.num_numbers - len(program.start()))
     rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
-    return end.removable > _STALLED and after > max(rounding, 1e-6) * end.first
+    return after > _LEFT * end.first or (end.removable > _STALLED and after > max(rounding, 1e-6) * end.first)
 
 
 class _End(NamedTuple):
@@ -141,6 +139,7 @@ class _End(NamedTuple):
     stopped: Stopped
     first: float  # root mean square of the residuals at the start
     removable: float  # share of the sum of squares that the linear model would still remove
+    is_searched: bool = False  # whether it began where the search between the bounds ended
 
 
 def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], has_noise: bool) -> Identification:
@@ -152,7 +151,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
     signals = explained[0].reshape(*program.windows.index.shape, -1)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
-    stalls = end.removable > _STALLED and _is_off(program, end, has_noise)
+    stalls = end.removable > _STALLED and not end.is_searched and _is_off(program, end, has_noise)
     nominal = np.asarray(coordinates.nominal, float)
     is_at_bound = coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype))
     return Identification(

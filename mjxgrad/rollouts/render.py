@@ -109,8 +109,7 @@ def _moves(
 def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     """Write frames as H.264 in MP4, with the ffmpeg of `imageio_ffmpeg`.
 
-    The file appears at its place, in an existing folder, once it is complete. An odd last row or column is left out, for H.264
-    takes even sizes only.
+    The file appears at its place, in an existing folder, once it is complete. H.264 refuses an odd last row, so it is left out.
 
     Raises:
         ValueError: if the video has no frames.

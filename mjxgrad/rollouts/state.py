@@ -59,8 +59,7 @@ class Trajectory(eqx.Module):
             pyramids have little friction (below 0.01; elliptic cones hardly have such a limit). Only `rollout` counts it.
         crowded: number of steps before it in which more contacts may have acted than the scene has slots for, see
             `max_contacts` of `load_scene`. Smoothed contacts act at any distance, so then every step of such a scene counts.
-        growth: largest growth of one fixed unit tangent of all initial velocities and positions along the way; None unless
-            asked for.
+        growth: largest growth of one fixed unit tangent of all initial velocities and positions along the way, if asked for.
         act: activations of actuators, as positions; only `rollout` keeps them.
     """
 

@@ -63,8 +63,7 @@ def load_scene(
         max_contacts: number of contact slots per friction dimension (`condim`), for the nearest contacts; only these cost
             anything in the solve. None has room for all possible contacts. `Trajectory.crowded` counts the steps that filled
             all slots.
-        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None is MJX where
-            possible.
+        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None prefers MJX.
 
     Returns:
         The scene. `print(scene.summary())` describes it.

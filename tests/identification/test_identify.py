@@ -65,6 +65,22 @@ def test_an_interruption_of_the_second_search_keeps_the_first_ones_values(cart, 
     np.testing.assert_allclose(result.values["gear"], 3.3, atol=0.1)
 
 
+@pytest.mark.parametrize("knows_noise", [True, False])
+def test_values_that_explain_nothing_are_not_called_found(cart, knows_noise):
+    """A recording of noise alone: no gear makes it, whether its size is stated or not."""
+    noise = Recording(
+        {"place": np.random.default_rng(0).normal(size=_STEPS + 1)},
+        _DRIVE[:, None],
+        noise={"place": 0.1},
+        knows_noise=knows_noise,
+    )
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [noise])
+    assert not result.is_sound
+    assert result.headline.startswith("Not found, for more than noise is left")
+    assert result.headline.endswith("before.")
+    assert ("times the noise" in result.headline) == knows_noise
+
+
 def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     """The place is the gear times a known course, here between the steps and with noise: a regression through the origin."""
     rng = np.random.default_rng(0)
