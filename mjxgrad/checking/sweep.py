@@ -171,7 +171,7 @@ class Sweep(Printed):
                 where = f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else where
                 none = "nowhere" if is_off.any() else "too noisy to tell"
                 found.setdefault("everywhere" if all(good) else where if any(good) else none, []).append(words)
-        return f"No bias above {_NONE:.0%} seen: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
+        return f"No bias seen to {_BLIND:.0%}: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
 
     def __str__(self) -> str:
         return f"{self.name}: {self.headline}\n\n{self.question}\n\n{self.result.summary(self.labels)}"

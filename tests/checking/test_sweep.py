@@ -76,7 +76,7 @@ def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
 def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_not_hold(swept):
     assert swept.labels == ["1000", "2500 (file)", "1e6"]
     lines = str(swept).splitlines()
-    assert lines[0].startswith("block.xml: No bias above 5% seen: ")
+    assert lines[0].startswith("block.xml: No bias seen to 25%: ")
     assert len(lines[0].removeprefix("block.xml: ").split()) <= 20
     assert [line.split("  ")[0] for line in lines[5:8]] == ["1000", "2500 (file)", "1e6 !"]
     (sentence,) = [line for line in lines if line.startswith("!")]
@@ -206,7 +206,7 @@ def test_the_answer_tells_a_bias_from_what_noise_hides(swept, monkeypatch):
         table |= {f"{name}_bias_low": table[f"{name}_bias"] - half, f"{name}_bias_high": table[f"{name}_bias"] + half}
     monkeypatch.setattr(type(swept.result), "table", lambda self: table)
     assert swept.headline == (
-        "No bias above 5% seen: first order up to 2500 (file) 1/s²; zeroth order too noisy to tell; α-order everywhere."
+        "No bias seen to 25%: first order up to 2500 (file) 1/s²; zeroth order too noisy to tell; α-order everywhere."
     )
     table |= {name: np.zeros((3, 1)) for name in table if name.endswith("_bias")}
     assert swept.headline.startswith("Stiffness changes nothing: nothing touches")
