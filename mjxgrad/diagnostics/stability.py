@@ -54,7 +54,7 @@ class Spring:
         given: time constant in the file, in s; None in the direct format.
         timestep: $h$, in s.
         integrator: integrator of the model.
-        size: largest travel in one step that is detected: the bodies' thickness (m); infinite but for contacts.
+        size: largest travel in one step that is detected: the bodies' thickness (m); infinite for planes and limits.
         num_rows: largest number of contacts of the pair at once.
         pyramid: sliding friction μ of a pyramidal contact in single precision; None for all others.
         speed: assumed speed of approach of a contact, in m/s; None for none.

@@ -31,9 +31,9 @@ class Recording:
         control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
             (m, rad). The default is 1. Ratios weigh the signals; the overall size is estimated.
-        knows_noise: whether `noise` is that of the measurements; otherwise it only weighs the signals.
         start: the state at time 0; None for what was measured then, else the scene's pose, at rest.
         name: name in messages.
+        knows_noise: whether `noise` is that of the measurements; otherwise it only weighs the signals.
     """
 
     measured: Mapping[str, Any]
@@ -41,9 +41,9 @@ class Recording:
     times: Any = None
     control_times: Any = None
     noise: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    knows_noise: bool = True
     start: State | None = None
     name: str = "the recording"
+    knows_noise: bool = True
 
     def __post_init__(self):
         for name in ("measured", "noise"):
@@ -99,7 +99,7 @@ class Recording:
             kept = np.zeros(0, bool) if at is None else at - start > -timestep / 2
             given = (None, None) if at is None else (np.asarray(controls)[kept], np.maximum(at[kept] - start, 0))
             windows.append(
-                Recording(measured, given[0], times[rows] - start, given[1], self.noise, self.knows_noise, name=name)
+                Recording(measured, given[0], times[rows] - start, given[1], self.noise, None, name, self.knows_noise)
             )
         return windows
 
