@@ -16,7 +16,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import Engine, engine_of
+from mjxgrad.native.engine import LATER, Engine, engine_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -57,7 +57,8 @@ def roll_out(
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        jacobians = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=tuple(given))
+        wanted = (*given, *LATER) if gradient == "slope" else tuple(given)
+        jacobians = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=wanted)
         forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
         for name, change in given.items():
             is_by_step = name in by_input
@@ -69,12 +70,15 @@ def roll_out(
         moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
         first = jnp.concatenate([moved, changes["qvel"], changes["act"]])
 
-        def advance(change: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-            matrix, force = step
-            change = jnp.einsum("sc,c->s", matrix, change, precision="highest") + force
-            return change, change
+        def advance(carry: tuple[Array, Array], step: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
+            (change, late), (force, matrix, *later) = carry, step
+            product = functools.partial(jnp.einsum, "sc,c->s", precision="highest")
+            end = product(matrix, change) + late + force
+            begun, late = (product(part, change) for part in later) if later else (0.0, late)
+            return (end - begun, late), end
 
-        _, course = jax.lax.scan(advance, first, (jacobians["state"], forced))
+        steps = forced, *(jacobians[name] for name in ("state", *LATER) if name in jacobians)
+        _, course = jax.lax.scan(advance, (first, jnp.zeros_like(first)), steps)
         nv = scene.model.nv
         parts = jnp.split(course, (nv, 2 * nv), axis=1)
         parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])

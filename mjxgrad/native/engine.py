@@ -22,6 +22,8 @@ from mjxgrad.stepping import Gradient
 INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat")
 """What may be given to each step, in the order in which MuJoCo keeps it."""
 START = ("time", "qpos", "qvel", "act")
+LATER = ("begun", "late")
+"""Of a slope over several steps: what events of a step add to its own end, and in its place to the end of the next."""
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
 _MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE_ACT.value
@@ -131,16 +133,16 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            shapes, size = self.shapes(wanted, sizes).items(), (num_substeps, len(rows))
+            kept = (*wanted, *LATER) if gradient == "slope" and num_substeps > 1 else wanted
+            shapes, size = self.shapes(kept, sizes).items(), (num_substeps, len(rows))
             found = {k: np.full((*size, *shape), np.nan if k == "end" else 0.0) for k, shape in shapes}
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
             for one in self.workers:
                 one.begin(gradient, is_centred)
             self._share(lambda one, piece: one.fill(models, speeds, rows, piece, found), len(rows))
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
-        for t, matrix in enumerate(found["state"][1:], 1):
-            own = {name: found[name][t] for name in wanted if name != "end"} | {"state": 0.0}
-            total |= {name: matrix @ total[name] + value for name, value in own.items()}
+        if num_substeps > 1:
+            total |= _through(found, ["state", *(name for name in wanted if name != "end")])
         return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in total.items()}
 
     def follow(
@@ -176,7 +178,12 @@ class Engine:
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, int]]:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
-        own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
+        own = dict.fromkeys(LATER, (size, size))
+        own |= {
+            "C": (model.nsensordata, size),
+            "D": (model.nsensordata, model.nu),
+            "end": (size - model.nv + model.nq,),
+        }
         return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k]) for k in wanted}
 
     def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
@@ -234,9 +241,12 @@ class _Worker:
         for i in index:
             self.use(models, i // num_steps, speeds)
             row = rows[i].copy() if np.isfinite(rows[i]).all() else None
-            for t in range(len(found["state"])):
+            last = len(found["state"]) - 1
+            for t in range(last + 1):
                 if row is not None:
-                    row = self._one(self.model, row, {name: value[t, i] for name, value in found.items()})
+                    following = row if t < last else rows[i + 1] if (i + 1) % num_steps else None
+                    parts = {name: value[t, i] for name, value in found.items()}
+                    row = self._one(self.model, row, parts, following if "late" in parts else None)
 
     def begin(self, gradient: Gradient, is_centred: bool = True) -> None:
         """Take a gradient for what follows."""
@@ -260,20 +270,24 @@ class _Worker:
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
         plain = self.given
-        row, change = row.copy(), change.copy()
+        row, change, late = row.copy(), change.copy(), np.zeros_like(change)
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            model, near, spanned, clear = self._near(self.model, row, ends[1])
-            nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
+            following = row.copy()
+            for name, value in inputs.items():
+                following[self.places[name]] = value[min(t + 1, len(pushes) - 1)].reshape(-1)
+            model, near, spanned, clear = self._near(self.model, row, ends[1], following)
+            nv, rest, moved, begun = model.nv, change.copy(), late, np.zeros_like(change)
+            late = np.zeros_like(change)
             if near is not None and near.events is not None:
-                felt = near.events.rows @ (change[:nv] + self.surfaces.lead * change[nv : 2 * nv])
+                felt = near.events.rows @ change[:nv] + near.events.ahead @ change[nv : 2 * nv]
                 rest[:nv] -= near.events.moves @ felt
-                moved += spanned @ felt
+                begun, late = spanned @ felt
             if near is not None and near.is_rough:
-                moved += self._visibly(model, clear, rest[:nv], near)
+                moved = moved + self._visibly(model, clear, rest[:nv], near)
                 rest[:nv] = 0.0
             width = self._width(near) / max(np.abs(rest).max(), np.abs(push).max(initial=0.0), 1e-30)
             sides = []
@@ -284,9 +298,11 @@ class _Worker:
             row[self.places["time"]] += model.opt.timestep
             for name, end in zip(START[1:], ends, strict=True):
                 row[self.places[name]] = found[name][t] = end
-            found["change"][t] = change
+            found["change"][t] = change + begun
 
-    def _one(self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]) -> np.ndarray | None:
+    def _one(
+        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], following: np.ndarray | None
+    ) -> np.ndarray | None:
         """Write the Jacobians of a step, and return the state after it where that is finite."""
         end = np.empty_like(row)
         mujoco.mj_setState(model, self.data, row, _ALL)
@@ -297,22 +313,24 @@ class _Worker:
         if "end" in found:
             mujoco.mj_getState(model, self.data, found["end"], _MOTION)
         row[self.places["warmstart"]] = end[self.places["warmstart"]]
-        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]])
+        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]], following)
         self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
         if near is None:
             return end
         matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
         if events is not None:
             rest -= events.moves @ events.rows
-            if self.surfaces.lead:
-                jumps = spanned - matrix[:, :nv] @ events.moves
-                matrix[:, nv : 2 * nv] += self.surfaces.lead * jumps @ events.rows
+            matrix[:, nv : 2 * nv] -= matrix[:, :nv] @ events.moves @ events.ahead
         if near.is_rough:
             matrix[:, :nv] = np.transpose([self._visibly(model, clear, change, near) for change in rest.T])
         elif events is not None:
             matrix[:, :nv] = matrix[:, :nv] @ rest
         if events is not None:
-            matrix[:, :nv] += spanned @ events.rows
+            felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, model.na)))
+            begun = spanned[0] @ felt
+            matrix += begun
+            if following is not None:
+                found["begun"][:], found["late"][:] = begun, spanned[1] @ felt
         return end
 
     def _visibly(
@@ -338,9 +356,9 @@ class _Worker:
         return _WIDTH if near is None or not near.is_rough or self.surfaces.lead else _RUBBING
 
     def _near(
-        self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
+        self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray, following: np.ndarray | None
     ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
-        """Return the model to take differences of, what is near, D, and the state about which differences cross no surface."""
+        """Return the model to take differences of, what is near, D₁ and D₂, and the state about which none crosses a surface."""
         near, nothing, shift, is_undecided = None, np.zeros((0, 0)), None, False
         if np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
@@ -353,7 +371,7 @@ class _Worker:
             model = min(undecided(model), key=lambda one: np.abs(self._step(one, row)[1] - after).max())
         if near is None or near.events is None:
             return model, near, nothing, row if shift is None else self._moved(model, row, shift)
-        spanned = self._spanned(model, row, events := near.events)
+        spanned = self._spanned(model, row, events := near.events, following)
         if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
             return model, dataclasses.replace(near, events=None), nothing, row
         clear = self._moved(model, row, clearance(_WIDTH, events.surfaces, events.gaps, events.centres))
@@ -374,13 +392,23 @@ class _Worker:
             row = self._moved(model, row, 8 * change)
         return row
 
-    def _spanned(self, model: mujoco.MjModel, row: np.ndarray, events: Events) -> Float[np.ndarray, "size events"]:
-        """Return D, the differences that span each event."""
+    def _spanned(
+        self, model: mujoco.MjModel, row: np.ndarray, events: Events, following: np.ndarray | None
+    ) -> Float[np.ndarray, "steps size events"]:
+        """Return D₁, the differences that span each event, and D₂ after a further step, by whose inputs it is."""
         columns = []
         for middle, width, move in zip(events.middles.T, events.widths, events.moves.T, strict=True):
-            ends = [self._moved(model, row, middle + side * width * move) for side in (1, -1)]
-            columns.append(self._difference(model, *ends) / (2 * width))
-        return np.array(columns).T
+            rows, column = [self._moved(model, row, middle + side * width * move) for side in (1, -1)], []
+            for _ in range(1 if following is None else 2):
+                ends = [self._step(model, one) for one in rows]
+                column.append(_change(model, *ends) / (2 * width))
+                if following is not None:
+                    rows = [following.copy(), following.copy()]
+                    for one, end in zip(rows, ends, strict=True):
+                        for name, value in zip(START[1:], end, strict=True):
+                            one[self.places[name]] = value
+            columns.append(column)
+        return np.transpose(columns, (1, 2, 0))
 
     def _differentiate(
         self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, is_centred: bool
@@ -397,7 +425,7 @@ class _Worker:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
             mujoco.mjd_transitionFD(model, self.data, width, is_centred, found["state"], by_control, *sensors)
-        for name in found.keys() - {"state", "C", "D", "end"} - ({"ctrl"} if not is_refused else set()):
+        for name in found.keys() - {"state", "C", "D", "end", *LATER} - ({"ctrl"} if not is_refused else set()):
             if name not in INPUTS:
                 self._by_number(model, row, name, found[name])
                 continue
@@ -459,3 +487,18 @@ def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarr
     positions = np.zeros(model.nv)
     mujoco.mj_differentiatePos(model, positions, 1.0, below[0], above[0])
     return np.concatenate([positions, above[1] - below[1], above[2] - below[2]])
+
+
+def _through(found: dict[str, np.ndarray], names: list[str]) -> dict[str, np.ndarray]:
+    """Return Jacobians of several steps, one after the other; the first is by the state."""
+    own, late = np.concatenate([found[name] for name in names], axis=-1), 0.0
+    size = own.shape[-2]
+    main = np.zeros_like(own[0])
+    main[..., :size], own[..., :size] = np.eye(size), 0.0
+    for t, matrix in enumerate(found["state"]):
+        end = matrix @ main + own[t] + late
+        begun, late = (found[name][t] @ main if name in found else 0.0 for name in LATER)
+        main = end - begun
+    return dict(
+        zip(names, np.split(end, np.cumsum([found[name].shape[-1] for name in names])[:-1], axis=-1), strict=True)
+    )

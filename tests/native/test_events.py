@@ -205,12 +205,46 @@ def test_a_hopper_that_lands_on_its_limits_has_its_slope():
     assert (off <= 2 * found.standard_error[0] + 0.05 * np.abs(found.slope)).all(), (found.mean[0], found.slope)
 
 
+def test_what_an_event_begins_is_followed_for_two_steps():
+    """Gymnasium's hopper, that lands, sticks and slips: spanned over one step alone, derivatives scatter ten times as far."""
+    scene = mg.load_scene(ASSETS / "hopper.xml")
+    scene = eqx.tree_at(lambda s: s.data.qpos, scene, jnp.array([0, 1.22, 0, -0.4, -0.5, 0.3]))
+    found = _compared(scene, 1, (0.0, 0.03), 250, [0.5, 0, 0, 0, 0, 0])
+    assert (found.spread[0] < 0.05 * np.abs(found.slope).max()).all()
+
+
+def test_a_contact_of_two_steps_has_its_slope():
+    """MuJoCo's stiffest: where the bounce is deep, the next step pushes no more. Over one step alone the mean is -31."""
+    scene = mg.load_scene(BALL.format(h=0.002).replace("<geom size", '<geom solref=".004 1" priority="1" size'))
+    found = _compared(scene, 0, (0.0, 0.032), 120, [-2.0], count=96, read=1)
+    assert abs(found.mean[0, 1] - found.slope[1]) < 0.3  # a tooth has -20
+
+
+def test_several_steps_at_once_are_those_of_a_rollout():
+    """Through a landing that begins in each of them."""
+    scene = mg.load_scene(STICK)
+    for height in np.linspace(-0.348, -0.356, 7):
+        place, speed = np.array([0.0, height, 0.0]), np.array([0.3, -2.0, 0.0])
+
+        def course(qvel, place=place):
+            start = mg.initial_state(scene, place, qvel)
+            last = mg.rollout(scene, start, horizon=3, contact=mg.Slope("mujoco")).final
+            return jnp.concatenate([last.qpos, last.qvel])
+
+        state = {"time": np.zeros((1, 1)), "qpos": place[None], "qvel": speed[None], "act": np.zeros((1, 0))}
+        how = {"gradient": "slope", "wanted": ("end",), "num_substeps": 3}
+        found = Engine(scene.mj_model).linearise({}, state, {"ctrl": np.zeros((1, 0))}, **how)
+        np.testing.assert_allclose(
+            found["state"][0, :, 3:], jax.jacrev(course)(jnp.asarray(speed)), rtol=1e-4, atol=1e-5
+        )
+
+
 def test_a_row_that_would_be_carried_across_zero_is_held():
     """Of a foot moved by a height and a knee, (1, 1/2): the knee turns by 0.4 of the gap, unless its limit lies nearer."""
     rows, widths = np.array([[1.0, 0.5], [0.0, -1.0]]), np.full(2, 1e-3)
     for gap, moves in ((-1e-4, [1.0, 0.0]), (-1e-3, [0.8, 0.4])):
         chosen = np.array([True, False])
-        found = _by_modes(rows, np.array([0.0, gap]), np.zeros(2), widths, chosen, chosen, np.ones(2))
+        found = _by_modes(rows, np.array([0.0, gap]), np.zeros(2), widths, np.zeros(2), chosen, chosen, np.ones(2))
         np.testing.assert_allclose(found.moves[:, 0] * np.sign(found.rows[0, 0]), moves, atol=1e-12)
 
 
