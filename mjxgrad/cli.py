@@ -208,6 +208,7 @@ def identify(
     scene: str,
     *recordings: str,
     parameter: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")],
+    noise: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")] = [],  # noqa: B006
     held_out: float = 0.2,
     free_start: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     output: Path = Path("identified"),
@@ -225,6 +226,8 @@ def identify(
         parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
             (actuators) and delay. kind:one,other is one value for both.
+        noise: name=standard deviation, of every measured column, or of qpos, qvel and sensors as a whole. Then the answer says
+            whether more than noise is left; by default each signal is weighed by how much it varies.
         held_out: share for validation only: every n-th recording, or the end of a single one.
         free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
@@ -239,8 +242,9 @@ def identify(
     if len(wanted) < len(parameter):
         raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
     motions = []
+    sizes = dict(map(_number, noise))
     for path in recordings:
-        one, unknown = files.recording(loaded, _existing(path))
+        one, unknown = files.recording(loaded, _existing(path), sizes)
         if one.times[-1] > 200 * (len(one.times) - 1) * loaded.mj_model.opt.timestep:  # milliseconds, perhaps
             log(f"rows of {path} are over 200 time steps of the scene apart: is its time in seconds?")
         if unknown:
@@ -321,6 +325,14 @@ def _library() -> Any:
     library = importlib.import_module("mjxgrad")
     library.keep_compiled()
     return library
+
+
+def _number(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise CommandError(f"--noise must be name=number, got {text}") from None
 
 
 def _existing(path: str) -> str:

@@ -1,7 +1,9 @@
 """Costs by name: functions of files and modules, and height, speed, uprightness and reach of bodies."""
 
 import contextlib
+import difflib
 import importlib
+import importlib.util
 import runpy
 import sys
 from collections.abc import Callable, Iterator
@@ -24,6 +26,10 @@ def named_cost(scene: Scene, name: str) -> Cost:
     """Return a cost by its name: of a file, of a module, or of a body or site of the scene."""
     kind, _, what = name.partition(":")
     if kind not in _BUILT_IN:
+        if (near := difflib.get_close_matches(kind, _BUILT_IN, 1)) and importlib.util.find_spec(kind) is None:
+            raise ValueError(
+                f"cost must be one of {', '.join(_BUILT_IN)}, or a function; did you mean {near[0]}:{what}?"
+            )
         return _function(name)
     if len(names := what.split("/")) != _BUILT_IN[kind]:
         raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")

@@ -136,7 +136,7 @@ class Knob:
         which = first(0).name or f"the {kind}" if count == 1 else f"all {count} {kind}s in a random mix"
         if kind == "joint":
             return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
-        return f"a constant control of {which}; noise of {self.noise:g} on it in each step, both in halves of its range"
+        return f"a constant added to the control of {which}, with noise of {self.noise:g} in each step; 1 is half its range"
 
 
 @dataclass(frozen=True)
@@ -201,17 +201,18 @@ def sweep(
 
     Args:
         source: an MJCF file, or another source for `load_scene`.
-        cost: as in `scene_task`.
+        cost: function of a trajectory; or file.py:function, module:function; or at the end height:body, speed:body,
+            upright:body, reach:body/site. None is a random mix of the heaviest body's final coordinates.
         stiffness: stiffnesses to sweep (1/s²), besides the file's own.
-        noise: standard deviation, as in `Knob`.
+        noise: standard deviation on each control of each step, in halves of its range; without controls, on velocities.
         num_samples: rollouts per estimate.
         num_reference: rollouts for the truth.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
-        **task_settings: start, horizon and contact of `scene_task`.
+        **task_settings: `start`, a key frame; `horizon`, the number of time steps; `contact`, `mg.Slope()` by default.
 
     Raises:
-        ValueError: as `scene_task` and `bias_variance`, or if a stiffness or the noise is not positive.
+        ValueError: if there is no such file, function, body or key frame, or a number is out of range.
     """
     given = np.atleast_1d(np.asarray(real("stiffness", stiffness), float))
     if not ((given > 0) & (given < np.inf)).all():
@@ -238,10 +239,15 @@ def sweep(
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
     question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
+    contact, is_c = task.contact, "mujoco" in (getattr(task.contact, "engine", None), scene.engine)
+    kind = {"slope": "the slope of the outcome", "discrete": "that of each step"}.get(
+        getattr(contact, "gradient", ""), f"{contact}"
+    )
+    question += f" Derivative: {kind}, by {'C MuJoCo' if is_c else 'MJX'}."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
     if left_out := len(swept) - len(result.cost):
         question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."
-    if row < len(result.cost):
+    if row < len(result.cost) and table["zeroth_variance"][row, 0] > 0:
         ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
         ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
         question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."

@@ -220,7 +220,8 @@ class BiasVariance(eqx.Module, Printed):
         what = "gradient" if self.params.shape[1] == 1 else "norm of the gradient"
         told = (
             f"Truth: {what} of the cost under noise, from separate rollouts; ± is half a {self.confidence:.0%} interval. "
-            "Variance: of one rollout. *: a bias that is significant over the whole table."
+            "Variance: of one rollout. *: a bias that is significant over the whole table. α: the weight of first order in "
+            "batches of 16 rollouts; at 0 its derivatives still lower the variance, without bias."
         )
         return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1]]
 
@@ -251,7 +252,14 @@ class BiasVariance(eqx.Module, Printed):
                         y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
                         look = {"color": colour, "marker": marker, "ls": line, "label": ESTIMATES[name]}
                         axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
-            lower.set(xlabel=title, yscale="log", xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
+            is_known = any(
+                (table[f"{name}_variance"][:, j] > 0).any() for name in ESTIMATES if f"{name}_variance" in table
+            )
+            lower.set(
+                xlabel=title,
+                yscale="log" if is_known else "linear",
+                xscale="log" if title[0] == "s" and (swept > 0).all() else "linear",
+            )
         # Where contact is so stiff that derivatives explode, a linear axis would hide all other biases.
         usual = float(np.median(np.abs(table["truth"])))
         if max(map(abs, axes[0, 0].get_ylim())) > _HIDDEN * usual > 0:

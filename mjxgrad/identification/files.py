@@ -7,7 +7,7 @@ import functools
 import os
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,15 +71,23 @@ def parameter(scene: Scene, text: str) -> Parameter:
     return parameters.inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
 
 
-def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...]]:
+def recording(
+    scene: Scene, path: str | Path, noise: Mapping[str, float] | None = None
+) -> tuple[Recording, tuple[str, ...]]:
     """Return a motion recorded as CSV with a line of names, or as NPZ, and the names of columns that the scene does not have.
 
     Columns are as `mjxgrad identify --help` tells. An array of an NPZ has one row per time, with one number or all of the
-    element's numbers. Each signal is weighed by its variation. The motion begins at its first row; missing parts are the
-    scene's pose, at rest.
+    element's numbers. The motion begins at its first row; missing parts are the scene's pose, at rest.
+
+    Args:
+        scene: what moved.
+        path: the file.
+        noise: standard deviations of all that was measured, by column or by signal, such as qvel. Without them each signal
+            is weighed by its variation.
 
     Raises:
-        ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator.
+        ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator; if the noise
+            is not positive, or not that of all measured columns.
     """
     columns = _read(Path(path))
     times = columns.pop("time", None)
@@ -109,10 +117,12 @@ def recording(scene: Scene, path: str | Path) -> tuple[Recording, tuple[str, ...
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
         given = (", ".join(unknown) or "none") + f"; did you mean {', '.join(near)}?" * bool(near)
         raise ValueError(f"{path} must have columns of the scene's joints or sensors, got {given}")
-    noise = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
+    scale = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
+    if noise:
+        scale = _stated(scene, found, noise, str(path))
     at = times - times[0]
     driven = {"controls": controls, "control_times": at} if scene.model.nu else {}
-    made = Recording(found, times=at, noise=noise, knows_noise=False, name=str(path), **driven)
+    made = Recording(found, times=at, noise=scale, knows_noise=bool(noise), name=str(path), **driven)
     return dataclasses.replace(made, start=start_of(scene, made, at)), tuple(unknown)
 
 
@@ -192,6 +202,40 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
         value = moves
     size = np.ma.masked_invalid(value).std(axis=0).filled(0.0)
     return np.maximum(size, _SMALLEST_SIZE * size.max(initial=0.0)) if size.any() else np.ones_like(size)
+
+
+def _stated(
+    scene: Scene, found: Mapping[str, np.ndarray], noise: Mapping[str, float], path: str
+) -> dict[str, np.ndarray]:
+    """Return the stated noise of each column; for positions, one number per velocity."""
+    model, places = scene.mj_model, _places(scene.mj_model)
+    scale = {name: np.full(value.shape[1], np.nan) for name, value in found.items()}
+    for name, size in noise.items():
+        if not 0 < size < np.inf:
+            raise ValueError(f"noise of {name} must be positive and finite, got {size}")
+        (_, signal, index, _), *more = (
+            [("", name, slice(None), 0)] if name in found else places.get(name, [("", "", 0, 0)])
+        )
+        if more or signal not in found:
+            raise ValueError(f"noise must name columns of {path}, or {', '.join(found)}; got {name}")
+        scale[signal][index] = size
+    for (signal, index), name in column_names(scene).items():
+        if signal in found and np.isfinite(found[signal][:, index]).any() and np.isnan(scale[signal][index]):
+            raise ValueError(f"noise must be stated of every measured column or of none, it lacks {name}")
+    if "qpos" in scale:
+        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        sizes = np.zeros(model.nv)
+        for dof, joint in enumerate(model.dof_jntid):
+            first, nth = model.jnt_qposadr[joint], dof - model.jnt_dofadr[joint]
+            turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL or (is_free[joint] and nth > 2)
+            own = (
+                slice(first + 3 * is_free[joint], first + 3 * is_free[joint] + 4)
+                if turns
+                else slice(first + nth, first + nth + 1)
+            )
+            sizes[dof] = np.nanmax(scale["qpos"][own], initial=0.0)
+        scale["qpos"] = sizes
+    return {name: np.where(size > 0, size, 1.0) for name, size in scale.items()}
 
 
 def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Recording], list[Recording]]:

@@ -63,8 +63,8 @@ def identify(
 
     Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
     derivatives through the simulation. Where it leaves more than the stated noise, as where contacts chatter, a second
-    descent begins where differential evolution of a robust loss ends between the bounds; not with `free_start`. Ctrl-C ends
-    the search with the best values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
+    descent begins where differential evolution of a robust loss ends between the bounds. Ctrl-C ends the search with the best
+    values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
 
     Args:
         scene: the scene with nominal values.
@@ -110,7 +110,7 @@ def identify(
     start = program.start()
     end = _descend(program, start, max_steps, log)
     has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
-    if _is_off(program, end, has_noise) and not free_start and end.stopped is not Stopped.INTERRUPTED:
+    if _is_off(program, end, has_noise) and end.stopped is not Stopped.INTERRUPTED:
         noise = 1.0 if has_noise else _rms(program, end.found) / _MISFIT
         loss, again = functools.partial(_robust, scale=_SHARE * noise), end._replace(stopped=Stopped.INTERRUPTED)
         with contextlib.suppress(KeyboardInterrupt):
@@ -271,7 +271,7 @@ class _Program:
             "recombination": 0.9,
         }
         best = scipy.optimize.differential_evolution(losses_at, list(zip(low, high, strict=True)), **settings)
-        return jnp.asarray(best.x, dtype)
+        return self.start().at[: len(low)].set(best.x)  # with starts as they were measured
 
     def offsets(self, point: Array) -> Array | None:
         """Return the offsets of the starts in a point, one row per window; None if starts are known."""

@@ -108,7 +108,7 @@ def test_a_sweep_of_gymnasiums_pendulum_is_one_line(tmp_path, monkeypatch, capsy
     arguments += ["--engine", "mujoco"]  # which compiles nothing
     assert cli.main(["sweep", PENDULUM, *arguments]) == 0
     said = capsys.readouterr().out
-    assert "a constant control of slide" in said
+    assert "a constant added to the control of slide" in said
     assert "No two geoms can touch" in said
     assert Path("sweep.html").read_text().startswith("<!DOCTYPE html>")
 
@@ -180,7 +180,7 @@ def test_costs_by_name_are_what_c_mujoco_says(folder):
         (["block.xml", "--cost", "broken.py:cost"], "'broken.py:cost' raised SyntaxError: invalid syntax"),
         (["block.xml", "--cost", "height:blok"], "there is no body or site 'blok' in the scene, but body: world"),
         (["block.xml", "--cost", "reach:block"], "reach is of two, as reach:hand/ball, got 'block'"),
-        (["block.xml", "--cost", "hight:block"], "cost must be file.py:function, module:function, or of a body as"),
+        (["block.xml", "--cost", "hight:block"], "or a function; did you mean height:block?"),
         (["block.xml", "--start", "far"], "keyframe must be one of ['near'] in this scene, got 'far'"),
         (["block.xml", "--stiffness", "0"], "stiffness must be positive and finite, got 0.0"),
         (["block.xml", "--html", "nowhere/page.html"], "nowhere/page.html cannot be written"),

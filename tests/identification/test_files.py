@@ -89,6 +89,29 @@ def named(scene, given):
     return {text.partition("=")[0]: files.parameter(scene, text) for text in given}
 
 
+def test_the_noise_is_that_of_columns_or_whole_signals(scene, tmp_path):
+    """Positions have one number per velocity; what was not measured weighs nothing."""
+    columns = {
+        "time": [0, 0.01],
+        "qpos:x": [0.5, 0.6],
+        "qpos:root[2]": [2, 3],
+        "qpos:root[3]": [1, 1],
+        "qvel:x": [0, 1],
+    }
+    _write(tmp_path / "a.csv", **columns, **{"ctrl:x": [0, 0], "servo": [0, 0]})
+    noise = {"qpos": 0.3, "qpos:x": 0.1, "qpos:root[2]": 0.2, "qvel": 0.5}
+    found, _ = files.recording(scene, tmp_path / "a.csv", noise)
+    np.testing.assert_allclose(found.noise["qpos"], [0.3, 0.3, 0.2, 0.3, 0.3, 0.3, 0.1])
+    assert found.knows_noise
+    for wrong, said in (
+        ({"qpos": 0.3}, "it lacks qvel:x"),
+        ({"qpos": 0.0}, "positive"),
+        ({"tip": 1.0}, "must name columns of"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            files.recording(scene, tmp_path / "a.csv", wrong)
+
+
 def test_parameters_are_named_in_a_word(scene):
     given = ["mass:cart=0.5..3", "friction:floor/ball", "damping:x", "gains:servo", "delay=0..0.1"]
     found = named(scene, given)
