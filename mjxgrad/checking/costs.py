@@ -26,7 +26,8 @@ def named_cost(scene: Scene, name: str) -> Cost:
     """Return a cost by its name: of a file, of a module, or of a body or site of the scene."""
     kind, _, what = name.partition(":")
     if kind not in _BUILT_IN:
-        if (near := difflib.get_close_matches(kind, _BUILT_IN, 1)) and importlib.util.find_spec(kind) is None:
+        is_module = kind.endswith(".py") or importlib.util.find_spec(kind.partition(".")[0]) is not None
+        if not is_module and (near := difflib.get_close_matches(kind, _BUILT_IN, 1)):
             raise ValueError(
                 f"cost must be one of {', '.join(_BUILT_IN)}, or a function; did you mean {near[0]}:{what}?"
             )
