@@ -493,12 +493,11 @@ def _through(found: dict[str, np.ndarray], names: list[str]) -> dict[str, np.nda
     """Return Jacobians of several steps, one after the other; the first is by the state."""
     own, late = np.concatenate([found[name] for name in names], axis=-1), 0.0
     size = own.shape[-2]
-    main = np.zeros_like(own[0])
-    main[..., :size], own[..., :size] = np.eye(size), 0.0
+    own[..., :size] = 0.0
+    main = end = np.broadcast_to(np.eye(size, own.shape[-1]), own.shape[1:])
     for t, matrix in enumerate(found["state"]):
         end = matrix @ main + own[t] + late
         begun, late = (found[name][t] @ main if name in found else 0.0 for name in LATER)
         main = end - begun
-    return dict(
-        zip(names, np.split(end, np.cumsum([found[name].shape[-1] for name in names])[:-1], axis=-1), strict=True)
-    )
+    widths = np.cumsum([found[name].shape[-1] for name in names])
+    return dict(zip(names, np.split(end, widths[:-1], axis=-1), strict=True))
