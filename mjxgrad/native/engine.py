@@ -175,15 +175,11 @@ class Engine:
             self._share(work, len(models))
         return found
 
-    def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
-        own = dict.fromkeys(LATER, (size, size))
-        own |= {
-            "C": (model.nsensordata, size),
-            "D": (model.nsensordata, model.nu),
-            "end": (size - model.nv + model.nq,),
-        }
+        own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
+        own |= dict.fromkeys(LATER, (size, size))
         return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k]) for k in wanted}
 
     def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
