@@ -80,7 +80,7 @@ def recording(
     element's numbers. The motion begins at its first row; missing parts are the scene's pose, at rest.
 
     Args:
-        scene: what moved.
+        scene: from `load_scene`.
         path: the file.
         noise: standard deviations of all that was measured, by column or by signal, such as qvel. Without them each signal
             is weighed by its variation.

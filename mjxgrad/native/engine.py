@@ -143,7 +143,7 @@ class Engine:
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
         if num_substeps > 1:
             total |= _through(found, ["state", *(name for name in wanted if name != "end")])
-        return {name: value.reshape(*batch, steps, *value.shape[1:]) for name, value in total.items()}
+        return {name: total[name].reshape(*batch, steps, *total[name].shape[1:]) for name in ("state", *wanted)}
 
     def follow(
         self,
