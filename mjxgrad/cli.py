@@ -173,13 +173,13 @@ def sweep(
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; or at the end height:body, speed:body,
             upright:body, reach:body/site; by default a random mix of the heaviest body's final coordinates.
-        start: a key frame by name; by default the reference pose.
+        start: a key frame by name, with its controls, about which the noise is; by default the reference pose.
         horizon: number of time steps; by default half a second, but 50 to 300 steps.
         stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
         samples: rollouts of each estimate; the truth takes eight times as many.
         gradient: the slope of the outcome, or the discrete one of each step.
-        engine: mjx, or mujoco for C MuJoCo, which compiles nothing and is slower; by default the scene's own.
+        engine: mjx, or mujoco for C MuJoCo, which compiles nothing and takes several times as long; by default the scene's own.
         seed: seed of all random numbers.
         html: the page to write.
     """
@@ -242,13 +242,13 @@ def identify(
     if len(wanted) < len(parameter):
         raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
     motions = []
-    sizes = dict(map(_number, noise))
+    sizes, left_out, unit = dict(map(_number, noise)), [], "times the noise" if noise else "times the motion"
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path), sizes)
         if one.times[-1] > 200 * (len(one.times) - 1) * loaded.mj_model.opt.timestep:  # milliseconds, perhaps
             log(f"rows of {path} are over 200 time steps of the scene apart: is its time in seconds?")
         if unknown:
-            log(f"not of this scene, and left out of {path}: {', '.join(unknown)}")
+            left_out.append(f"\nNot of this scene, and left out of {path}: {', '.join(unknown)}.")
         motions.append(one)
     fitted, judged = files.hold_out(motions, held_out)
     log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
@@ -259,9 +259,9 @@ def identify(
         held_out=judged,
         delay="delay" if "delay" in wanted else None,
         free_start=free_start,
-        log=lambda step, metrics: log(f"step {step}: error {100 * metrics['rms']:.3g} % of the motion"),
+        log=lambda step, metrics: log(f"step {step}: error {metrics['rms']:.3g} {unit}"),
     )
-    print(f"{result.headline}\n\n{result.summary()}", flush=True)
+    print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)
     output.mkdir(parents=True, exist_ok=True)
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")

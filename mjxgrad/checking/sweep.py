@@ -31,6 +31,7 @@ from mjxgrad.stepping import Contact, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
+_SHORT = 0.45  # time step times the frequency of a contact, from which it lasts two steps
 _NONE, _BLIND = 0.05, 0.25  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
 
@@ -167,8 +168,8 @@ class Sweep(Printed):
                 is_off = table[f"{name}_is_biased"] & (abs(table[f"{name}_bias"]) > _NONE * truth)
                 good: list[bool] = (~is_off & (width / 2 <= _BLIND * truth)).all(axis=1).tolist()  # pyright: ignore[reportAssignmentType]
                 until = good.index(False) if False in good else len(good)
-                where = f"at {sum(good)} of {len(good)}"
-                where = f"up to {self.labels[until - 1]} 1/s²" if until == sum(good) else where
+                where = "at " + ", ".join(label for label, one in zip(self.labels, good, strict=True) if one)
+                where = (f"up to {self.labels[until - 1]}" if until == sum(good) else where) + " 1/s²"
                 none = "nowhere" if is_off.any() else "too noisy to tell"
                 found.setdefault("everywhere" if all(good) else where if any(good) else none, []).append(words)
         return f"No bias seen to {_BLIND:.0%}: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
@@ -238,12 +239,18 @@ def sweep(
     )
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
-    question += "" if scene.pairs else " No two geoms can touch, so stiffness has no effect."
+    told = (
+        "Swept contacts are critically damped" if scene.pairs else "No two geoms can touch, so stiffness has no effect"
+    )
+    question += f" {told}."
     contact, is_c = task.contact, "mujoco" in (getattr(task.contact, "engine", None), scene.engine)
     kind = {"slope": "the slope of the outcome", "discrete": "that of each step"}.get(
         getattr(contact, "gradient", ""), f"{contact}"
     )
     question += f" Derivative: {kind}, by {'C MuJoCo' if is_c else 'MJX'}."
+    shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
+    if isinstance(contact, Slope) and not is_c and scene.pairs and swept[-1] >= shortest:
+        question += f" From {shortest:.2g} 1/s² on contacts last two time steps or less, and MJX's slope is wrong: take C MuJoCo."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
     if left_out := len(swept) - len(result.cost):
         question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."

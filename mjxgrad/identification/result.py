@@ -31,6 +31,7 @@ _NOT_TOLD_APART = 1e-6  # of the largest singular value: the data would have to 
 _RELATED = 0.5  # correlation of residuals that makes intervals too narrow by √3
 _REMOVED = 1e-3  # of the residuals at the start: less comes from numerical differences
 _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred times
+_DEPARTS = 2.0  # of what is left of the fitted motions
 _BETTER = 0.8  # of the first residuals
 _CHANCE = 1e-4  # probability that residuals as large are noise
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
@@ -120,11 +121,12 @@ class Identification(Printed):
             found = f"{len(self.at_bounds)} of {count} numbers ended at a bound"
         if self._is_unexplained:
             found = "Not found, for more than noise is left"
-        rms, which = (self.rms, "error") if self.held_out_rms is None else (self.held_out_rms, "held-out error")
-        if self.has_noise:
-            return f"{found}: {which} {rms[1]:.3g} times the noise, {rms[0]:.3g} before."
-        before, after = (f"{100 * one:.2g} %" if one < 0.995 else f"{100 * one:.0f} %" for one in rms)
-        return f"{found}: {which} {after} of the motion, {before} before."
+        before, after, *held_out = (
+            f"{one:.3g}" if self.has_noise else f"{100 * one:.2g} %" if one < 0.995 else f"{100 * one:.0f} %"
+            for one in (*self.rms, *(self.held_out_rms or ())[1:])
+        )
+        unit = "times the noise" if self.has_noise else "of the motion"
+        return f"{found}: error {after} {unit}, {before} before{'; held out ' * bool(held_out)}{''.join(held_out)}."
 
     def summary(self) -> str:
         """Describe the result in text: the values with their intervals, then the warnings."""
@@ -165,6 +167,11 @@ class Identification(Printed):
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
                 "other first values, free_start=True, shorter windows (recording.cut) or more parameters, or correct the noise."
+            )
+        if self.held_out_rms is not None and self.held_out_rms[1] > _DEPARTS * max(self.rms[1], self.has_noise):
+            found.append(
+                f"What was held out departs ({self.held_out_rms[1]:.3g}): it is foretold from its first row, whose noise grows, "
+                "most where contacts chatter. Without it, the values may be right."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
