@@ -243,6 +243,8 @@ def identify(
         raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
     motions = []
     sizes, left_out, unit = dict(map(_number, noise)), [], "times the noise" if noise else "times the motion"
+    if len(sizes) < len(noise):
+        raise CommandError(f"--noise must name each column once, got {' '.join(noise)}")
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path), sizes)
         if one.times[-1] > 200 * (len(one.times) - 1) * loaded.mj_model.opt.timestep:  # milliseconds, perhaps

@@ -31,7 +31,7 @@ from mjxgrad.stepping import Contact, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
-_SHORT = 0.45  # time step times the frequency of a contact, from which it lasts two steps
+_SHORT = 0.49  # time step times the frequency of a contact, from which it lasts two steps
 _NONE, _BLIND = 0.05, 0.25  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
 
@@ -250,7 +250,7 @@ def sweep(
     question += f" Derivative: {kind}, by {'C MuJoCo' if is_c else 'MJX'}."
     shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
     if isinstance(contact, Slope) and not is_c and scene.pairs and swept[-1] >= shortest:
-        question += f" From {shortest:.2g} 1/s² on contacts last two time steps or less, and MJX's slope is wrong: take C MuJoCo."
+        question += f" From {format_number(float(f'{shortest:.1g}'))} 1/s² on contacts last two time steps, and MJX's slope is wrong: take C MuJoCo."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
     if left_out := len(swept) - len(result.cost):
         question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."

@@ -213,27 +213,22 @@ def _stated(
     for name, size in noise.items():
         if not 0 < size < np.inf:
             raise ValueError(f"noise of {name} must be positive and finite, got {size}")
-        (_, signal, index, _), *more = (
-            [("", name, slice(None), 0)] if name in found else places.get(name, [("", "", 0, 0)])
-        )
-        if more or signal not in found:
+        place = places.get(name, ())
+        signal, index = (name, slice(None)) if name in found else place[0][1:3] if len(place) == 1 else ("", 0)
+        if signal not in found:
             raise ValueError(f"noise must name columns of {path}, or {', '.join(found)}; got {name}")
         scale[signal][index] = size
     for (signal, index), name in column_names(scene).items():
         if signal in found and np.isfinite(found[signal][:, index]).any() and np.isnan(scale[signal][index]):
             raise ValueError(f"noise must be stated of every measured column or of none, it lacks {name}")
     if "qpos" in scale:
-        is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
         sizes = np.zeros(model.nv)
         for dof, joint in enumerate(model.dof_jntid):
-            first, nth = model.jnt_qposadr[joint], dof - model.jnt_dofadr[joint]
-            turns = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL or (is_free[joint] and nth > 2)
-            own = (
-                slice(first + 3 * is_free[joint], first + 3 * is_free[joint] + 4)
-                if turns
-                else slice(first + nth, first + nth + 1)
-            )
-            sizes[dof] = np.nanmax(scale["qpos"][own], initial=0.0)
+            kind, nth = model.jnt_type[joint], dof - model.jnt_dofadr[joint]
+            first, count = model.jnt_qposadr[joint] + nth, 1
+            if kind == mujoco.mjtJoint.mjJNT_BALL or (kind == mujoco.mjtJoint.mjJNT_FREE and nth > 2):
+                first, count = first - nth % 3, 4  # its quaternion
+            sizes[dof] = np.nanmax(scale["qpos"][first : first + count], initial=0.0)
         scale["qpos"] = sizes
     return {name: np.where(size > 0, size, 1.0) for name, size in scale.items()}
 

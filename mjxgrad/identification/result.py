@@ -168,7 +168,8 @@ class Identification(Printed):
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
                 "other first values, free_start=True, shorter windows (recording.cut) or more parameters, or correct the noise."
             )
-        if self.held_out_rms is not None and self.held_out_rms[1] > _DEPARTS * max(self.rms[1], self.has_noise):
+        left = max(self.rms[1], 1.0 if self.has_noise else _REMOVED * self.rms[0])
+        if self.held_out_rms is not None and self.held_out_rms[1] > _DEPARTS * left:
             found.append(
                 f"What was held out departs ({self.held_out_rms[1]:.3g}): it is foretold from its first row, whose noise grows, "
                 "most where contacts chatter. Without it, the values may be right."

@@ -272,9 +272,11 @@ class _Worker:
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            following = row.copy()
-            for name, value in inputs.items():
-                following[self.places[name]] = value[min(t + 1, len(pushes) - 1)].reshape(-1)
+            following = row if self.gradient == "slope" else None
+            if following is not None and t + 1 < len(pushes):
+                following = row.copy()
+                for name, value in inputs.items():
+                    following[self.places[name]] = value[t + 1].reshape(-1)
             model, near, spanned, clear = self._near(self.model, row, ends[1], following)
             nv, rest, moved, begun = model.nv, change.copy(), late, np.zeros_like(change)
             late = np.zeros_like(change)
@@ -394,17 +396,19 @@ class _Worker:
         """Return D₁, the differences that span each event, and D₂ after a further step, by whose inputs it is."""
         columns = []
         for middle, width, move in zip(events.middles.T, events.widths, events.moves.T, strict=True):
-            rows, column = [self._moved(model, row, middle + side * width * move) for side in (1, -1)], []
-            for _ in range(1 if following is None else 2):
-                ends = [self._step(model, one) for one in rows]
-                column.append(_change(model, *ends) / (2 * width))
-                if following is not None:
-                    rows = [following.copy(), following.copy()]
-                    for one, end in zip(rows, ends, strict=True):
-                        for name, value in zip(START[1:], end, strict=True):
-                            one[self.places[name]] = value
-            columns.append(column)
+            ends = [self._step(model, self._moved(model, row, middle + side * width * move)) for side in (1, -1)]
+            column = [_change(model, *ends)]
+            if following is not None:
+                column.append(_change(model, *(self._step(model, self._at(following, end)) for end in ends)))
+            columns.append(np.divide(column, 2 * width))
         return np.transpose(columns, (1, 2, 0))
+
+    def _at(self, row: np.ndarray, end: list[np.ndarray]) -> np.ndarray:
+        """Return a whole state with position, velocity and activation of another."""
+        placed = row.copy()
+        for name, value in zip(START[1:], end, strict=True):
+            placed[self.places[name]] = value
+        return placed
 
     def _differentiate(
         self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, is_centred: bool
