@@ -250,7 +250,8 @@ def sweep(
     question += f" Derivative: {kind}, by {'C MuJoCo' if is_c else 'MJX'}."
     shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
     if isinstance(contact, Slope) and not is_c and scene.pairs and swept[-1] >= shortest:
-        question += f" From {format_number(float(f'{shortest:.1g}'))} 1/s² on contacts last two time steps, and MJX's slope is wrong: take C MuJoCo."
+        told = "on contacts last two time steps, and MJX's slope is wrong: take C MuJoCo"
+        question += f" From {format_number(float(f'{shortest:.1g}'))} 1/s² {told}."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
     if left_out := len(swept) - len(result.cost):
         question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."
