@@ -361,7 +361,7 @@ class _Worker:
         if np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
             if self.gradient == "slope":
-                near = self.surfaces.near(self.far, row[self.places["qvel"]], after)
+                near = self.surfaces.near(self.far, row[self.places["qvel"]], after, self.data.qacc_smooth)
                 is_undecided = near is not None and near.is_undecided
             else:
                 shift, is_undecided = self.surfaces.beside(_WIDTH, self.far)

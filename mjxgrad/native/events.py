@@ -27,7 +27,8 @@ an event costs four more steps, and a step without any costs nothing.
 - **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
   wider, holds all of them, with as much less weight.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
-  impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply.
+  impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply. What cannot leave a surface
+  within 10 h² |J a|, by its free acceleration a less what damping keeps of it, creeps and does not chatter; ε is no larger.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
 - **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.
@@ -56,6 +57,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse.csgraph import connected_components
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
+_BOUNCE, _SMALLEST = 10.0, 1e-6  # by how many steps' accelerations contacts bounce, squared (m or rad)
 _HAIR = 6e-5  # m, over which the geometry of contacts is averaged
 _LARGEST_TURN = 0.02  # rad, of the smallest bodies
 _NOTHING = 1e-30
@@ -134,6 +136,7 @@ class Surfaces:
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
         self.longest = max(1.0, self.lengths.max(initial=0.0))
+        self.kept = 1 / (1 + model.opt.timestep * model.dof_damping * model.dof_invweight0)
         # How far ahead of the start of a step its stages lie, in the mean (s).
         self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
         travel = (0.5 * self.timestep + 2 * self.lead) * np.max(np.abs(speeds), axis=0, initial=0.0)
@@ -161,7 +164,11 @@ class Surfaces:
         return (clearance(change, rows[near], gaps[near], 0.0) if near.any() else None), is_undecided
 
     def near(
-        self, data: mujoco.MjData, before: Float[np.ndarray, " nv"], after: Float[np.ndarray, " nv"]
+        self,
+        data: mujoco.MjData,
+        before: Float[np.ndarray, " nv"],
+        after: Float[np.ndarray, " nv"],
+        free: Float[np.ndarray, " nv"],
     ) -> "Near | None":
         """Return what is near the position in `data`, moving as before and after the step; None if nothing is."""
         mujoco.mj_fwdPosition(self.model, data)
@@ -173,6 +180,7 @@ class Surfaces:
         if self.lead:
             # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
             centres, widths = -self.lead * rate, _STAGES * widths
+        least = np.minimum(least, np.maximum(_BOUNCE * self.timestep**2 * np.abs(rows @ (self.kept * free)), _SMALLEST))
         widths = np.maximum(widths, least)
         is_rough &= gaps - centres < widths
         is_moved = self._moves(rows)

@@ -84,12 +84,12 @@ def test_the_motion_is_the_same_to_the_last_bit():
     np.testing.assert_array_equal(*courses)
 
 
-def _events(xml, qpos, qvel):
+def _events(xml, qpos, qvel, free=9.81):
     model = mujoco.MjModel.from_xml_string(xml)
     surfaces = Surfaces(model, levers_of(model), np.array([qvel], float))
     data = mujoco.MjData(surfaces.model)
     data.qpos, data.qvel = qpos, qvel
-    near = surfaces.near(data, np.array(qvel, float), np.array(qvel, float))
+    near = surfaces.near(data, np.array(qvel, float), np.array(qvel, float), np.full(model.nv, free))
     return None if near is None else near.events
 
 
@@ -105,9 +105,18 @@ def test_an_event_is_a_gap_within_half_a_step_of_travel():
 
 
 def test_without_speed_the_impedance_gives_the_width():
-    """0.06 of its width, 1 mm by default."""
+    """0.06 of its width, 1 mm by default, where something could bounce."""
     assert _events(BALL.format(h=0.002), [5.9e-5 - 0.1], [0.0]) is not None
     assert _events(BALL.format(h=0.002), [6.1e-5 - 0.1], [0.0]) is None
+    assert _events(BALL.format(h=0.002), [5.9e-5 - 0.1], [0.0], free=0.0) is None
+
+
+def test_a_joint_that_creeps_to_its_limit_does_not_feel_it_before():
+    """Damping lets it fall by 2.5 µm a step: after ten it has moved with its start, and is 20 µm from its limit."""
+    xml = """<mujoco><option timestep=".0025"/><worldbody><body><joint type="slide" axis="0 0 1" range="0 1" damping="30"/>
+        <geom size=".1" mass=".003"/></body></worldbody></mujoco>"""
+    found = _compared(mg.load_scene(xml), 0, (4.5e-5, 5.5e-5), 10, [-1e-3], read=1)
+    np.testing.assert_allclose(found.derivatives[0, :, 1], 1.0, rtol=1e-4)
 
 
 def test_margins_and_joint_limits_have_gaps_of_their_own():
