@@ -1,5 +1,6 @@
 """Numbers and names as text, for messages and tables; and files of text."""
 
+import html
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -15,6 +16,17 @@ class Printed:
         super().__init_subclass__(**settings)
         # IPython asks class by class: the `__repr__` of a dataclass would come before a base class's method.
         cls._repr_pretty_ = lambda self, printer, cycle: printer.text(str(self))
+
+
+class Paged(Printed):
+    """Something with a page, `as_html`, which a notebook shows where the packages for pages are installed."""
+
+    def _repr_html_(self) -> str | None:
+        try:
+            page = self.as_html()  # pyright: ignore[reportAttributeAccessIssue]
+        except ImportError:
+            return None
+        return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40em; border: 0"></iframe>'
 
 
 def name_pairs(pairs: Sequence[object]) -> str:

@@ -39,7 +39,7 @@ def cost(trajectory):  # yours: here how far the first coordinate comes (m or ra
 
 
 low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON)
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON, {contact})
 
 
 def controls(knots):  # between −1 and 1, held for a while each, to the actuators' ranges
@@ -56,7 +56,7 @@ result = mg.optimise(
     num_steps=30,
     log=lambda step, metrics: step % 10 or print(step, metrics["cost"]),
 )
-course = mg.rollout(scene, task.state, controls(result.params["knots"]))
+course = mg.rollout(scene, task.state, controls(result.params["knots"]), contact=task.contact)
 print("cost", cost(course), "from", task.run(controls(start)).cost)
 mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 '''
@@ -171,13 +171,14 @@ def sweep(
 
     Args:
         scene: an MJCF file.
-        cost: file.py:function or module:function, from a trajectory to its cost; or at the end height:body, speed:body,
-            upright:body, reach:body/site; by default a random mix of the heaviest body's final coordinates.
+        cost: file.py:function or module:function, from a trajectory to its cost, such as `def cost(course): return
+            course.qpos[-1, 0]`; or at the end height:body, speed:body, upright:body, reach:body/site; by default a random
+            mix of the heaviest body's final coordinates.
         start: a key frame by name, with its controls, about which the noise is; by default the reference pose.
         horizon: number of time steps; by default half a second, but 50 to 300 steps.
         stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
-        samples: rollouts of each estimate; the truth takes eight times as many.
+        samples: rollouts of each estimate; the truth takes sixteen times as many, without derivatives.
         gradient: the slope of the outcome, or the discrete one of each step.
         engine: mjx, or mujoco for C MuJoCo, which compiles nothing and takes several times as long; by default the scene's own.
         seed: seed of all random numbers.
@@ -191,7 +192,7 @@ def sweep(
         **({} if stiffness is None else {"stiffness": stiffness}),
         noise=noise,
         num_samples=samples,
-        num_reference=8 * samples,
+        num_reference=16 * samples,
         seed=seed,
         log=log,
         start=start,
@@ -251,6 +252,7 @@ def identify(
             log(f"rows of {path} are over 200 time steps of the scene apart: is its time in seconds?")
         if unknown:
             left_out.append(f"\nNot of this scene, and left out of {path}: {', '.join(unknown)}.")
+            log(left_out[-1].strip())  # a slip is seen before the search
         motions.append(one)
     fitted, judged = files.hold_out(motions, held_out)
     log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
@@ -301,6 +303,7 @@ def new(
         keyframe="" if key is None else f", keyframe={key!r}",
         horizon=min(300, max(50, round(0.5 / (advice.timestep or timestep)))),
         per_knot=max(1, round(0.05 / (advice.timestep or timestep))),
+        contact=importlib.import_module("mjxgrad.checking.findings").chosen(advice.gradient),
         estimator=advice.estimator,
         stddev=advice.stddev,
         video=str(output.with_suffix(".mp4")),

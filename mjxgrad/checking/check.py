@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._arrays import function, instance, real, whole
-from mjxgrad._text import Printed, format_number
+from mjxgrad._text import Paged, format_number
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import Finding, Recommendation
@@ -38,7 +39,7 @@ _MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
 @dataclass(frozen=True)
-class Verdict(Printed):
+class Verdict(Paged):
     """The result of `check`.
 
     Attributes:
@@ -239,7 +240,7 @@ def _code(scene: Scene, advice: Recommendation, path: str) -> str:
         settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
     noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
-    key = first_keyframe(scene.mj_model)
+    key, yours = first_keyframe(scene.mj_model), "  # your file" * (not Path(path).exists())
     keyframe = "" if key is None else f", keyframe={key!r}"
     if scene.model.nu:
         objective, start = f"mg.open_loop(task, stddev={noise})", "jnp.zeros(objective.dim)"
@@ -252,9 +253,9 @@ import jax
 import jax.numpy as jnp
 import mjxgrad as mg
 
-scene = mg.load_scene({path!r}{settings})
+scene = mg.load_scene({path!r}{settings}){yours}
 cost = lambda trajectory: trajectory.qpos[-1, 0]  # yours
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {findings.WORDS[advice.gradient]})
+task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
 objective = {objective}
 estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
 """

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
@@ -55,7 +56,9 @@ def named_cost(scene: Scene, name: str) -> Cost:
 
 def _function(name: str) -> Callable[..., Any]:
     """Return a function by file.py:function or module:function, the module also in the current folder."""
-    source, _, function = name.rpartition(":")
+    source, colon, function = name.rpartition(":")
+    if not colon:
+        raise ValueError(f"cost must be file.py:function, module:function, or of a body as height:torso, got {name!r}")
     if source.endswith(".py") and not Path(source).is_file():
         raise ValueError(f"cost: there is no file {source}")
     with _told(name):
@@ -73,6 +76,8 @@ def _told(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
+        if isinstance(error, jax.errors.TracerArrayConversionError):
+            raise ValueError(f"cost {name!r} must compute with jax.numpy, got NumPy on traced numbers") from error
         forms = "file.py:function, module:function, or of a body as height:torso"
         raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}; a cost must be {forms}") from error
 

@@ -26,7 +26,6 @@ _CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
 _FEWEST_TEETH = 4
 _DISAGREES = 0.1  # relative difference beyond which the slopes at two time steps disagree
 
-WORDS = {"slope": "contact=mg.Slope()", "discrete": "contact=mg.Discrete()"}
 """Arguments of `mg.rollout` and tasks, by kind of derivative."""
 
 
@@ -37,6 +36,12 @@ class Finding:
     kind: Kind
     text: str
     is_fault: bool = False
+
+
+def chosen(gradient: str) -> str:
+    """Return a gradient as an argument: by C MuJoCo's engine, which compiles nothing, but on GPUs, where MJX is faster."""
+    engine = '"mujoco"' if jax.default_backend() == "cpu" else ""
+    return f"contact=mg.{gradient.title()}({engine})"
 
 
 @dataclass(frozen=True)
@@ -164,7 +169,7 @@ def _slope_finding(found: Sequence[Slope]) -> Finding:
     if not found[-1].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     read = [one for one in found if one.num_readings]
-    parts = [f"{WORDS[one.kind]}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
+    parts = [f"{chosen(one.kind)}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
     lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
     return Finding("slope", f"{lead} {' '.join(parts)}", is_fault=_is_mostly_off(found))
 
@@ -294,7 +299,7 @@ def _time_step(spring: Spring) -> str:
 def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
     """Return the answer in at most 15 words."""
     ahead = f"{advice.horizon * motions.timestep:.2g} s ahead"
-    answer = f"{WORDS[advice.gradient]} and {advice.estimator}, {ahead}"
+    answer = f"{chosen(advice.gradient)} and {advice.estimator}, {ahead}"
     minded = [finding.kind for finding in findings if finding.is_fault or finding.kind == "not_measured"]
     words = {
         "time_step": "the time step is too long",

@@ -1,5 +1,6 @@
 """Bias and variance of gradients over contact stiffness, for a scene, cost and start given by names."""
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
@@ -11,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function, is_known, real, whole
-from mjxgrad._text import Printed, format_number
+from mjxgrad._text import Paged, format_number
 from mjxgrad.checking.check import Source, _outcomes
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range
@@ -27,11 +28,13 @@ from mjxgrad.objective.task import SceneTask
 from mjxgrad.report import Block, Table, page, svg
 from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
-from mjxgrad.stepping import Contact, Slope
+from mjxgrad.stepping import Contact, Discrete, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
 _SHORT = 0.49  # time step times the frequency of a contact, from which it lasts two steps
+_PAIRS = 256  # pairs of rollouts at once
+_FEW = 8  # numbers of a direction that are printed
 _NONE, _BLIND = 0.05, 0.25  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
 
@@ -90,6 +93,23 @@ class CommonShift(OpenLoop):
         return Partial(jnp.matmul, jnp.tile(self.direction, self.task.horizon)[None])
 
 
+@eqx.filter_jit
+def _in_pairs(
+    objective: CommonShift, direction: Float[Array, " nu"], keys: Key[Array, " pairs"]
+) -> Float[Array, " pairs"]:
+    """Return the difference quotient of each pair, by the deviations of the noise along the shift."""
+    along = jnp.broadcast_to(direction / jnp.sqrt(objective.noise_shape[0]), objective.noise_shape)  # a unit vector
+
+    def quotient(key: PRNGKeyArray) -> Float[Array, ""]:
+        noise_key, width_key = jax.random.split(key)
+        noise = objective.sample_noise(noise_key) / objective.stddev
+        rest, width = noise - (noise * along).sum() * along, jnp.linalg.norm(jax.random.normal(width_key, (3,)))
+        above, below = (objective.stddev * (rest + side * width * along) for side in (1, -1))
+        return (objective.value(jnp.zeros(1), above) - objective.value(jnp.zeros(1), below)) / (2 * width)
+
+    return jax.lax.map(quotient, keys, batch_size=_PAIRS)
+
+
 def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1"]) -> Float[Array, ""]:
     start = eqx.tree_at(lambda state: state.qvel, task.state, task.state.qvel + speed[0] * along)
     return task.run(jnp.zeros((task.horizon, 0)), start=start).cost
@@ -113,6 +133,13 @@ class Knob:
         scene = self.task.scene
         return float(np.median(np.asarray(scene.contact_parameters().stiffness))) if scene.pairs else 0.0
 
+    @functools.cached_property
+    def direction(self) -> Float[np.ndarray, " moved"]:
+        """The unit vector along which all controls, or velocities, are shifted."""
+        count = self.task.num_controls or self.task.scene.mj_model.nv
+        drawn = np.random.default_rng(self.seed).normal(size=count)
+        return drawn / np.linalg.norm(drawn) if count > 1 else np.ones(1)
+
     def __call__(self, softness: Softness) -> Objective:
         """Return the objective at a stiffness, at critical damping."""
         task, scene, is_own = self.task, self.task.scene, softness.stiffness == self.own
@@ -123,25 +150,50 @@ class Knob:
             model, soft = scene.model, scene.with_softness(Softness(softness.stiffness, 1.0)).model
             fields = {k: jnp.where(is_own, getattr(model, k), getattr(soft, k)) for k in CONTACT_FIELDS}
             task = eqx.tree_at(lambda one: one.scene.model, task, model.replace(**fields))
-        count, like = task.num_controls or scene.mj_model.nv, task.state.qpos.dtype
-        drawn = np.random.default_rng(self.seed).normal(size=count)
-        along = jnp.asarray(drawn / np.linalg.norm(drawn) if count > 1 else np.ones(1), like)
+        like = task.state.qpos.dtype
+        along = jnp.asarray(self.direction, like)
         if not task.num_controls:
             return parameter_noise(Partial(_thrown, task, along), self.noise, dim=1)
         half = jnp.asarray(half_range(scene), like)
         return CommonShift(task, self.noise * half, dim=1, direction=half * along)  # pyright: ignore[reportCallIssue]
 
+    def truth(
+        self, softness: Softness, key: PRNGKeyArray, num_rollouts: int
+    ) -> tuple[Float[np.ndarray, "1 1"], Float[np.ndarray, "1 1"]]:
+        r"""Return the gradient by differences of pairs of rollouts, and its standard error.
+
+        The noise's part along the shift, of standard deviation σ, smooths the cost f; all else is the same in a pair. With the
+        density of the half width r being Maxwell's, $r^2 \varphi(r/\sigma)/\sigma^3$, the mean of (f(r) − f(−r)) / 2r is the
+        slope of the smoothed cost, for any f (Stein's identity). Where f is linear it does not scatter at all.
+        """
+        task = self.task
+        if isinstance(task.contact, Slope | Discrete):  # the motion is MuJoCo's, which compiles nothing
+            task = eqx.tree_at(lambda one: one.contact, task, Discrete("mujoco"))
+        objective = dataclasses.replace(self, task=task)(softness)
+        keys = jax.random.split(key, num_rollouts // 2)
+        # The shift moves the noise's part along it by the root of so many steps, over its deviation.
+        scale = np.sqrt(task.horizon) / self.noise
+        slopes = scale * np.asarray(_in_pairs(objective, jnp.asarray(self.direction), keys), float)  # pyright: ignore[reportCallIssue]
+        slopes = slopes[np.isfinite(slopes)]
+        error = slopes.std(ddof=1) / np.sqrt(len(slopes)) if len(slopes) > 1 else np.nan
+        return np.reshape(slopes.mean() if len(slopes) else np.nan, (1, 1)), np.reshape(error, (1, 1))
+
     def __str__(self) -> str:
         kind, model = "actuator" if self.task.num_controls else "joint", self.task.scene.mj_model
         count, first = (model.nu, model.actuator) if kind == "actuator" else (model.njnt, model.joint)
-        which = first(0).name or f"the {kind}" if count == 1 else f"all {count} {kind}s in a random mix"
+        mix = (
+            f"({', '.join(f'{x:.3g}' for x in self.direction)})"
+            if len(self.direction) <= _FEW
+            else "of a random direction"
+        )
+        which = first(0).name or f"the {kind}" if count == 1 else f"all {count} {kind}s in a mix {mix}"
         if kind == "joint":
             return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
         return f"a constant added to the control of {which}, with noise of {self.noise:g} in each step; 1 is half its range"
 
 
 @dataclass(frozen=True)
-class Sweep(Printed):
+class Sweep(Paged):
     """The result of `sweep`: the scene, a description, the stiffness of the file's contacts, and the measurements."""
 
     name: str
@@ -193,7 +245,7 @@ def sweep(
     stiffness: Sequence[float] = STIFFNESS,
     noise: float = 0.1,
     num_samples: int = 256,
-    num_reference: int = 2048,
+    num_reference: int = 4096,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
     **task_settings: Any,
@@ -234,6 +286,7 @@ def sweep(
         softness=Softness(stiffness=swept),
         num_samples=num_samples,
         num_reference=num_reference,
+        reference=knob.truth if task.num_controls else None,
         compiler_options=compiler_options(),
         progress=None if log is None else lambda done, total: log(f"{done} of {total} stiffnesses"),
     )
@@ -253,6 +306,8 @@ def sweep(
         told = "on contacts last two time steps, and MJX's slope is wrong: take C MuJoCo"
         question += f" From {format_number(float(f'{shortest:.1g}'))} 1/s² {told}."
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
+    if len(result.cost) and not np.isfinite(table["truth"]).any():
+        raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
     if left_out := len(swept) - len(result.cost):
         question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."
     if row < len(result.cost) and table["zeroth_variance"][row, 0] > 0:

@@ -278,6 +278,7 @@ def bias_variance(
     softness: PyTree,
     num_samples: int = 256,
     num_reference: int = 2048,
+    reference: Callable[[PyTree, PRNGKeyArray, int], tuple[ArrayLike, ArrayLike]] | None = None,
     confidence: float = 0.95,
     compiler_options: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -296,6 +297,8 @@ def bias_variance(
         num_samples: differentiated rollouts per softness and point. At least 2.
         num_reference: rollouts for the reference. They count per softness for a single parameter with noise (one landscape
             serves all points), otherwise per softness and point. At least 4.
+        reference: function from one softness, a key and this number to the gradient at all points and its standard error, from
+            rollouts of its own; None takes more of the rollouts that are differentiated.
         confidence: coverage of the intervals.
         compiler_options: options for XLA.
         progress: called after every softness with the number done and the total.
@@ -336,7 +339,10 @@ def bias_variance(
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
         measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
-        if not is_line:
+        if reference is not None:
+            found = reference(one, jax.random.fold_in(key, 0), num_reference)
+            measured |= dict(zip(("reference", "reference_error"), map(jnp.asarray, found), strict=True))
+        elif not is_line:
             others = [jax.random.fold_in(key, i) for i in range(-(-num_reference // num_samples))]
             runs = [compiled(one, params, k)[0]["reference"] for k in others]
             measured["reference"] = sum(value for value, _ in runs) / len(runs)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import one_key, real, whole
+from mjxgrad._arrays import instance, one_key, real, whole
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -150,6 +150,7 @@ class Environment(InScene):
         obs = self.observe(physics, memory)
         action = jnp.zeros(self.num_actions, obs.dtype)
         terms = jax.eval_shape(lambda: self.rewards(physics, action, physics, memory))
+        instance(f"rewards of {type(self).__name__}", terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
         zero, no = jnp.zeros((), obs.dtype), jnp.array(False)
         metrics = dict.fromkeys([*terms, "diverged"], zero)
         counter, hidden = jnp.zeros((), jnp.int32), self.privileged(physics, memory)

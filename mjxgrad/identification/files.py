@@ -17,7 +17,7 @@ import numpy as np
 from mjxgrad._text import write
 from mjxgrad.identification import parameters
 from mjxgrad.identification.parameters import Parameter
-from mjxgrad.identification.recording import Recording, start_of
+from mjxgrad.identification.recording import Recording, coordinates, start_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
@@ -104,15 +104,21 @@ def recording(
         if len(place) > 1:
             kinds = ", ".join(sorted(f"{kind}:{name}" for kind, *_ in place))
             raise ValueError(f"{name} of {path} must say what it is, as one of {kinds}")
+        if not place and name.partition(":")[0] in ("qpos", "qvel", "ctrl", "act", "sensor"):
+            near = "".join(f"; did you mean {one}?" for one in difflib.get_close_matches(name, places, 1))
+            raise ValueError(f"{path} has a column {name}, which is not of this scene{near}")
         if not place:
             unknown.append(name)
             continue
         _, signal, index, width = place[0]
         found.setdefault(signal, np.full((len(times), width), np.nan))[:, index] = column
     controls = found.pop("ctrl", np.full((len(times), scene.model.nu), np.nan))
-    if bad := np.flatnonzero(~np.isfinite(controls).all(axis=0)).tolist():
+    missing = ~np.isfinite(controls)
+    if bad := np.flatnonzero(missing.any(axis=0)).tolist():
         names = ", ".join(scene.mj_model.actuator(i).name or f"[{i}]" for i in bad)
-        raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; it lacks {names}")
+        row = int(missing[:, bad].any(axis=1).argmax())
+        lacks = f"it lacks {names}" + f" from {times[row]:g} s" * (not missing[:, bad].all())
+        raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; {lacks}")
     if not found:
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
         given = (", ".join(unknown) or "none") + f"; did you mean {', '.join(near)}?" * bool(near)
@@ -153,11 +159,15 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         names, *rows = [row for row in csv.reader(file) if row] or [[]]
     if twice := [name for i, name in enumerate(names) if name in names[:i]]:
         raise ValueError(f"{', '.join(twice)} stands there more than once")
+    numbers = []
     for line, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")
-    numbers = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
-    return dict(zip(map(str.strip, names), numbers.reshape(len(rows), len(names)).T, strict=True))
+        try:
+            numbers.append([float(cell) if cell.strip() else np.nan for cell in row])
+        except ValueError as error:
+            raise ValueError(f"line {line}: {error}") from None
+    return dict(zip(map(str.strip, names), np.reshape(numbers, (len(rows), len(names))).T, strict=True))
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
@@ -222,14 +232,7 @@ def _stated(
         if signal in found and np.isfinite(found[signal][:, index]).any() and np.isnan(scale[signal][index]):
             raise ValueError(f"noise must be stated of every measured column or of none, it lacks {name}")
     if "qpos" in scale:
-        sizes = np.zeros(model.nv)
-        for dof, joint in enumerate(model.dof_jntid):
-            kind, nth = model.jnt_type[joint], dof - model.jnt_dofadr[joint]
-            first, count = model.jnt_qposadr[joint] + nth, 1
-            if kind == mujoco.mjtJoint.mjJNT_BALL or (kind == mujoco.mjtJoint.mjJNT_FREE and nth > 2):
-                first, count = first - nth % 3, 4  # its quaternion
-            sizes[dof] = np.nanmax(scale["qpos"][first : first + count], initial=0.0)
-        scale["qpos"] = sizes
+        scale["qpos"] = np.array([np.nanmax(scale["qpos"][one], initial=0.0) for one in coordinates(model)])
     return {name: np.where(size > 0, size, 1.0) for name, size in scale.items()}
 
 

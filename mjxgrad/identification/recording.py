@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -167,9 +168,11 @@ def _window(
         columns = scene.model.nv if name == "qpos" else width
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
-        if name == "qpos":  # an incomplete quaternion is useless
-            value = np.where(is_there, value, np.asarray(scene.data.qpos))
-            is_there = _joints_there(scene.model, is_there)
+        if name == "qpos":
+            value, given = np.where(is_there, value, np.asarray(scene.data.qpos)), is_there
+            is_there = np.stack([given[:, one].all(axis=1) for one in coordinates(scene.model)], axis=1)
+            if any(given[:, one].any() and not given[:, one].all(axis=1).any() for one in coordinates(scene.model)):
+                raise ValueError(f"qpos of {recording.name} must have all four numbers of a quaternion, or none")
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
     return Windows(
@@ -182,11 +185,14 @@ def _window(
     )
 
 
-def _joints_there(model: mjx.Model, is_there: np.ndarray) -> np.ndarray:
-    """Return for each velocity whether all coordinates of its joint were measured."""
-    joint_of = np.searchsorted(model.jnt_qposadr, np.arange(model.nq), side="right") - 1
-    of_joint = np.stack([is_there[:, joint_of == joint].all(axis=1) for joint in range(model.njnt)], axis=1)
-    return of_joint[:, model.dof_jntid]
+def coordinates(model: mjx.Model | mujoco.MjModel) -> list[slice]:
+    """Return for each velocity the numbers of a position that it changes: one, or all four of a quaternion."""
+    found, (ball, free) = [], (int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE))
+    for dof, joint in enumerate(np.asarray(model.dof_jntid).tolist()):
+        kind, nth = model.jnt_type[joint], dof - model.jnt_dofadr[joint]
+        first, turns = int(model.jnt_qposadr[joint] + nth), kind == ball or (kind == free and nth > 2)
+        found.append(slice(first - nth % 3, first - nth % 3 + 4) if turns else slice(first, first + 1))
+    return found
 
 
 def _width(scene: Scene, name: str) -> int:

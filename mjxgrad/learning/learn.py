@@ -16,6 +16,7 @@ References:
     ICLR 2022, arXiv:2204.07137 (SHAC).
 """
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -124,5 +125,11 @@ def learn(
         on_all_devices=True,
     )
     seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (len(progress.seconds), *shape))
+    if progress.found["skipped"][-log_every:].all():
+        warnings.warn(
+            f"nothing was learnt: no gradient of the last {log_every} updates was finite, and their mean reward is "
+            f"{progress.found['reward'][-1].mean():.3g}; look for roots and divisions in rewards and observe",
+            stacklevel=2,
+        )
     history = {name: jnp.asarray(values) for name, values in (progress.found | {"seconds": seconds}).items()}
     return Learned(progress.carry.policy, history, progress.carry)

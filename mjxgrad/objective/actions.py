@@ -227,8 +227,22 @@ def closed_loop(task: Task, policy: Policy, stddev: Stddev, *, params: PyTree = 
     instance("policy", policy, Callable, "a function of params and state")
     stddev = _action_stddev(task, stddev)
     flat, unravel = (None, unchanged) if params is None else _flat(params)
-    dim = None if flat is None else flat.size
-    return ClosedLoop(task=task, policy=as_pytree(policy), stddev=stddev, unravel=unravel, dim=dim)
+    dim, given = (None, _OfVector(as_pytree(policy))) if flat is None else (flat.size, as_pytree(policy))
+    return ClosedLoop(task=task, policy=given, stddev=stddev, unravel=unravel, dim=dim)
+
+
+class _OfVector(eqx.Module):
+    """A policy that says what it was given where it cannot take a vector."""
+
+    policy: Policy
+
+    def __call__(self, params: Vector, state: PyTree) -> Float[Array, " nu"]:
+        try:
+            return self.policy(params, state)
+        except (TypeError, AttributeError) as error:
+            raise type(error)(
+                f"{error}; without params= of closed_loop the policy gets a vector: give an example of its own"
+            ) from error
 
 
 def _flat(params: PyTree) -> tuple[Vector, Callable[[Vector], PyTree]]:

@@ -16,7 +16,7 @@ from jaxtyping import ArrayLike, Float
 
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Exact, Smoother
-from mjxgrad.planning.system import Cost, System
+from mjxgrad.planning.system import Cost, System, check_problem
 from mjxgrad.planning.trajectory import Course, Problem, Search, checked, iterate, shifted
 from mjxgrad.rollouts import State
 
@@ -70,6 +70,7 @@ class Controller(Printed):
         """
         if deadline is not None and not deadline > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
+        check_problem(system, cost)
         began, origin = time.perf_counter(), system.origin
         for message in smoother.warnings(system, origin):
             warnings.warn(message, stacklevel=2)

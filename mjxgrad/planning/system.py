@@ -6,6 +6,7 @@ A state is one flat vector. A change of it has the coordinates of the tangent sp
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import known, whole
+from mjxgrad._arrays import instance, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
@@ -203,6 +204,12 @@ class Cost(eqx.Module):
         return stages.sum() + self.terminal(system, states[-1])
 
 
+def check_problem(system: Any, cost: Any) -> None:
+    """Refuse what is no system or no cost."""
+    instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
+    instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
+
+
 class GoalCost(Cost):
     """Weighted squared distances to a goal and squared controls, each with a factor of one half.
 
@@ -225,11 +232,16 @@ class GoalCost(Cost):
                 raise ValueError(f"{name} must be at least 0, got {weight}")
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
-        away = self._weighted("stage_weight", system.difference(state, self.goal))
+        away = self._weighted("stage_weight", self._away(system, state))
         return 0.5 * (away + self._weighted("control_weight", control))
 
     def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
-        return 0.5 * self._weighted("terminal_weight", system.difference(state, self.goal))
+        return 0.5 * self._weighted("terminal_weight", self._away(system, state))
+
+    def _away(self, system: System, state: StateVector) -> Float[Array, " changes"]:
+        if self.goal.shape != state.shape:
+            raise ValueError(f"goal must be a state of this system, of shape {state.shape}, got {self.goal.shape}")
+        return system.difference(state, self.goal)
 
     def _weighted(self, name: str, change: Float[Array, " size"]) -> Float[Array, ""]:
         weight = getattr(self, name)
@@ -263,6 +275,8 @@ def terminal_model(cost: Cost, system: System, state: StateVector) -> Quadratic:
 
 def _model(function, at: Float[Array, " both"]) -> Quadratic:
     """Return gradient and Hessian with negative curvature removed, which would turn descent into ascent."""
+    if shape := jax.eval_shape(function, at).shape:
+        raise ValueError(f"stage and terminal of a cost must return one number each, got shape {shape}")
     hessian = jax.hessian(function)(at)
     values, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
     return Quadratic(jax.grad(function)(at), (vectors * jnp.maximum(values, 0)) @ vectors.T)

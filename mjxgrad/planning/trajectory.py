@@ -13,7 +13,16 @@ from mjxgrad._arrays import instance, known, one_key
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
+from mjxgrad.planning.system import (
+    ControlVector,
+    Cost,
+    Quadratic,
+    StateVector,
+    System,
+    check_problem,
+    stage_model,
+    terminal_model,
+)
 from mjxgrad.rollouts.arguments import sequence_of
 
 _Row = Float[Array, "*iterations"]
@@ -217,6 +226,7 @@ def optimise_trajectory(
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
     one_key(key)
+    check_problem(system, cost)
     instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
     start = jnp.asarray(start)
     for message in smoother.warnings(system, start):

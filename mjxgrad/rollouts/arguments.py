@@ -34,7 +34,10 @@ def sequence_of(
             continue
         if jnp.shape(value) != (horizon, num_controls):
             meaning = "one row per step and one column per actuator"
-            raise ValueError(f"{name} must have shape {(horizon, num_controls)}, {meaning}, got {jnp.shape(value)}")
+            is_turned = jnp.ndim(value) == 2 and jnp.shape(value)[0] == num_controls > 1
+            wanted = (len(value[0]) if is_turned else horizon, num_controls)
+            hint = "; transpose it" * is_turned
+            raise ValueError(f"{name} must have shape {wanted}, {meaning}, got {jnp.shape(value)}{hint}")
         numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
         if numbers is not None and not np.isfinite(numbers).all():
             row, column = np.argwhere(~np.isfinite(numbers))[0]

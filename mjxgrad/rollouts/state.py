@@ -16,6 +16,7 @@ from mjxgrad.contact.parameters import geom_name
 from mjxgrad.scene import Scene, SceneWarning
 
 VELOCITY_LIMIT = 1e4  # m/s or rad/s, beyond which a rollout counts as diverged
+_HARMLESS = 0.01  # share of its range by which a joint may begin beyond it
 _DEEP = 0.02  # m, largest penetration of a pose without a warning
 _NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 LARGEST_GROWTH = 1e3
@@ -123,7 +124,9 @@ def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:
         return names.index(keyframe)
     if isinstance(keyframe, int) and 0 <= keyframe < model.nkey:
         return keyframe
-    raise ValueError(f"keyframe must be one of {names or 'none'} in this scene, got {keyframe!r}")
+    if not names:
+        raise ValueError(f"keyframe must be None, for this scene has none, got {keyframe!r}")
+    raise ValueError(f"keyframe must be one of {names} in this scene, got {keyframe!r}")
 
 
 def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayLike) -> Iterator[str]:
@@ -144,7 +147,9 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
                 raise ValueError(f"qpos must have a quaternion that is not zero, got zeros for {name}")
         elif has_limits and model.jnt_limited[joint]:
             unit, value, (low, high) = units[int(kind)], pose[first], ranges[joint]
-            slack = 1e-6 * max(1.0, abs(value))  # single precision's rounding
+            slack = 1e-6 * max(1.0, abs(value)) + _HARMLESS * (
+                high - low
+            )  # single precision's rounding; noise of starts
             if not low - slack <= value <= high + slack:
                 yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
     if of_file is None:

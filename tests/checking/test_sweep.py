@@ -56,6 +56,19 @@ def swept(folder):
     )
 
 
+def test_the_truth_of_a_jump_is_the_noises_density_and_of_a_line_exact(folder):
+    """A block in flight goes left or right as its pushes' mean does: the slope is √T / σ √(2π) by the mean push."""
+    for cost, slope, scatters in (
+        (lambda trajectory: jnp.where(trajectory.qvel[-1, 0] > 0, 1.0, 0.0), math.sqrt(20 / (2 * math.pi)) / 0.2, True),
+        (lambda trajectory: trajectory.qvel[-1, 0], 20 * 0.002 * 6 / 0.2, False),
+    ):
+        scene = mg.load_scene(str(folder / "block.xml"))
+        knob = Knob(scene_task(scene, cost, horizon=20), noise=0.2)  # within the range of controls
+        value, error = knob.truth(mg.Softness(1e4), jax.random.key(0), 2048)
+        assert abs(value.item() - slope) <= (3 * error.item() if scatters else 1e-3 * slope)
+        assert 0 < error.item() < (0.05 if scatters else 1e-4) * slope
+
+
 def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
     """By differences of the mean over common noise, a twentieth of its standard deviation to both sides."""
     scene = mg.load_scene(folder / "block.xml")

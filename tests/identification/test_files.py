@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -11,6 +12,7 @@ import mjxgrad as mg
 from mjxgrad import cli
 from mjxgrad.identification import files
 from mjxgrad.identification.parameters import write_all
+from mjxgrad.identification.recording import Recording, residuals, stack
 
 _SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
   <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/></body>
@@ -70,7 +72,9 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
         ({"time": [0, 1], "x": [1, 2]}, "must say what it is, as one of ctrl:x, qpos:x"),
         ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo"),
         ({"time": [0, 1], "ctrl:x": [0, 0], "servo": [0, 0], "palce": [1, 2]}, "did you mean place"),
-        ({"time": [0, "soon"], "x": [1, 2]}, "a line of names, then numbers"),
+        ({"time": [0, "soon"], "x": [1, 2]}, "a line of names, then numbers.*line 3: could not"),
+        ({"time": [0, 1], "qpos:palce": [1, 2]}, "qpos:palce, which is not of this scene; did you mean qpos:"),
+        ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, np.nan], "servo": [0, 0]}, "it lacks x from 1 s"),
         (bytes(range(256)), "a.csv must be a line of names, then numbers"),
         (b"time,x\n0,1,2", "line 2 has 3 cells, not 2"),
     ],
@@ -83,6 +87,20 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
     path.rename(tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"a\.npz must be an NPZ with arrays of numbers"):
         files.recording(scene, tmp_path / "a.npz")
+
+
+def test_each_number_of_a_free_joint_counts_but_a_part_of_a_quaternion():
+    """Motion capture of places alone: three of six changes are compared, and the fit sees them."""
+    scene = mg.load_scene("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+    places = np.full((3, 7), np.nan)
+    places[:, :3] = [[0, 0, 0], [0.1, 0.2, 0.3], [0.2, 0.4, 0.6]]
+    window = stack(scene, [Recording({"qpos": places})])
+    np.testing.assert_allclose(window.weight["qpos"][0], np.tile([1, 1, 1, 0, 0, 0], (3, 1)))
+    left, _ = residuals(scene, jax.tree.map(lambda x: x[0], window), None, None, contact=mg.Discrete("mujoco"))
+    np.testing.assert_allclose(left.reshape(3, 6)[1, :2], [-0.1, -0.2])
+    places[:, 3] = 1.0
+    with pytest.raises(ValueError, match="all four numbers of a quaternion"):
+        stack(scene, [Recording({"qpos": places})])
 
 
 def named(scene, given):
