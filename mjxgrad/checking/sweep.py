@@ -94,9 +94,7 @@ class CommonShift(OpenLoop):
 
 
 @eqx.filter_jit
-def _in_pairs(
-    objective: CommonShift, direction: Float[Array, " nu"], keys: Key[Array, " pairs"]
-) -> Float[Array, " pairs"]:
+def _in_pairs(objective: Any, direction: Float[Array, " nu"], keys: Key[Array, " pairs"]) -> Float[Array, " pairs"]:
     """Return the difference quotient of each pair, by the deviations of the noise along the shift."""
     along = jnp.broadcast_to(direction / jnp.sqrt(objective.noise_shape[0]), objective.noise_shape)  # a unit vector
 
