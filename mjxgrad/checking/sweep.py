@@ -229,10 +229,10 @@ class Sweep(Paged):
 
     def as_html(self) -> str:
         """Return the sweep as a self-contained page; needs `mjxgrad[render]`."""
-        picture = svg(self.result.plot, "Bias and variance over stiffness")
+        parts = [svg(functools.partial(self.result.plot, one), f"{one} over stiffness") for one in ("bias", "variance")]
         head, *rows = self.result.rows(self.labels)
         told = f"Bars: {self.result.confidence:.0%} intervals. Bias in cost per unit of what is moved, variance in its square."
-        blocks = [Block(text=self.question, drawings=[picture], caption=told), Block(table=Table(head, rows))]
+        blocks = [Block(text=self.question, drawings=parts, caption=told), Block(table=Table(head, rows))]
         return page(self.headline, f"mjxgrad sweep {self.name}", [*blocks, Block(items=self.result.notes())])
 
 

@@ -16,7 +16,7 @@ import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -235,37 +235,36 @@ class BiasVariance(eqx.Module, Printed):
 
     __str__ = summary
 
-    def plot(self) -> Any:
+    def plot(self, only: Literal["bias", "variance"] | None = None) -> Any:
         """Draw bias and variance against softness by matplotlib, one column per point, and return the figure."""
         require()
         import matplotlib.pyplot as plt
 
         table, (title, swept), points = self.table(), self.knob, len(self.params)
+        shown = ("bias", "variance") if only is None else (only,)
         settings = {"squeeze": False, "sharex": True, "sharey": "row", "layout": "constrained"}
-        figure, axes = plt.subplots(2, points, figsize=(max(4.6, 3.2 * points), 5.4), **settings)
-        for j, (upper, lower) in enumerate(axes.T):
-            upper.axhline(0, color="grey", lw=0.8)
-            upper.plot(swept, table["truth"][:, j], color="grey", ls="-.", label="the gradient itself")
-            for axis, what in ((upper, "bias"), (lower, "variance")):
+        size = (max(4.6, 3.2 * points), 2.7 * len(shown) + 0.5 * (only is not None))
+        figure, axes = plt.subplots(len(shown), points, figsize=size, **settings)
+        for row, what in zip(axes, shown, strict=True):
+            for j, axis in enumerate(row):
                 for name, (colour, marker, line) in _LOOKS.items():
                     if f"{name}_{what}" in table:
                         y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
                         look = {"color": colour, "marker": marker, "ls": line, "label": ESTIMATES[name]}
                         axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
-            is_known = any(
-                (table[f"{name}_variance"][:, j] > 0).any() for name in ESTIMATES if f"{name}_variance" in table
-            )
-            lower.set(
-                xlabel=title,
-                yscale="log" if is_known else "linear",
-                xscale="log" if title[0] == "s" and (swept > 0).all() else "linear",
-            )
+                is_log = what == "variance" and any((line.get_ydata() > 0).any() for line in axis.lines)
+                axis.set(yscale="log" if is_log else "linear")
+                axis.set(xscale="log" if title[0] == "s" and (swept > 0).all() else "linear")
+                if what == "bias":
+                    axis.axhline(0, color="grey", lw=0.8)
+                    axis.plot(swept, table["truth"][:, j], color="grey", ls="-.", label="the gradient itself")
+            row[0].set_ylabel("bias of the gradient (cost per unit)" if what == "bias" else "variance of one rollout")
         # Where contact is so stiff that derivatives explode, a linear axis would hide all other biases.
         usual = float(np.median(np.abs(table["truth"])))
-        if max(map(abs, axes[0, 0].get_ylim())) > _HIDDEN * usual > 0:
-            axes[0, 0].set_yscale("symlog", linthresh=10 ** np.ceil(np.log10(usual)))
-        axes[0, 0].set_ylabel("bias of the gradient (cost per unit)")
-        axes[1, 0].set_ylabel("variance of one rollout")
+        if shown[0] == "bias" and max(map(abs, axes[0, 0].get_ylim())) > _HIDDEN * usual > 0:
+            axes[0, 0].set_yscale("symlog", linthresh=10 ** (np.floor(np.log10(usual)) - 1))
+        for axis in axes[-1]:
+            axis.set_xlabel(title)
         axes[0, 0].legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
         return figure
 

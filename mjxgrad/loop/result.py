@@ -1,6 +1,7 @@
 """The result of a descent: last and best parameters, the history, and the reason for stopping."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -10,9 +11,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mjxgrad._text import Printed, format_range
+from mjxgrad._text import Paged, Printed, format_range
 from mjxgrad.estimators import GradientEstimate, Reason
 from mjxgrad.loop.run import Progress
+from mjxgrad.report import Block, page, svg
 
 
 class Stopped(eqx.Enumeration):
@@ -115,7 +117,7 @@ class Best(eqx.Module):
         return jax.tree.map(lambda new, old: jnp.where(is_better, new, old), other, self)
 
 
-class History(Record):
+class History(Record, Printed):
     """A run step by step: with many seeds, leaves have seeds on the first axis; steps are on the last.
 
     The fields are those of `Record`, in NumPy, with cumulative counts. After a run stopped before the others its fields
@@ -129,6 +131,20 @@ class History(Record):
     noise_free_cost: Float[np.ndarray, "..."]
     seconds: Float[np.ndarray, " steps"]
 
+    def __str__(self) -> str:
+        at = [format_range((float(np.nanmin(x)), float(np.nanmax(x)))) for x in (self.cost[..., 0], self.cost[..., -1])]
+        text = f"{len(self.seconds)} steps: mean cost under noise {at[0]} at first, {at[1]} at last"
+        return f"{text}{self.about_alpha}."
+
+    @property
+    def about_alpha(self) -> str:
+        """The mean α and its usual reason, as the end of a sentence; empty where the method has none."""
+        if not np.isfinite(self.alpha).any():
+            return ""
+        usual = np.bincount(np.ravel(jax.tree.leaves(self.reason)[0])).argmax()
+        reason = Reason[jax.tree.map(lambda _: jnp.asarray(usual), Reason.fixed)]
+        return f"; α {np.nanmean(self.alpha):.2g} in the mean, mostly since {reason}"
+
     @classmethod
     def of(cls, progress: Progress) -> "History":
         """Return the history from the records of a descent."""
@@ -140,7 +156,7 @@ class History(Record):
         return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(progress.seconds))
 
 
-class Optimisation(eqx.Module, Printed):
+class Optimisation(eqx.Module, Paged):
     """The result of a run, or of one run per seed; all fields but the seconds then have a leading axis.
 
     Attributes:
@@ -182,4 +198,22 @@ class Optimisation(eqx.Module, Printed):
         runs = [jax.tree.map(lambda x, i=i: jnp.ravel(x)[i], self.stopped) for i in range(np.size(self.num_steps))]
         reasons = "; ".join(dict.fromkeys(Stopped[run] for run in runs))
         spent = f"{self.seconds:.3g} s, and {self.compile_seconds:.3g} s to compile"
-        return f"Best cost {cost} after {steps} steps, {skipped} skipped: {reasons}. {rollouts} rollouts took {spent}."
+        text = f"Best cost {cost} after {steps} steps, {skipped} skipped: {reasons}{self.history.about_alpha}."
+        return f"{text} {rollouts} rollouts took {spent}."
+
+    def as_html(self) -> str:
+        """Return the run as a self-contained page; needs `mjxgrad[render]`."""
+        shown = {"cost under noise": self.history.cost, "α": self.history.alpha}
+        drawings = [
+            svg(functools.partial(_over_steps, *one), one[0]) for one in shown.items() if np.isfinite(one[1]).any()
+        ]
+        return page(str(self).partition(":")[0] + ".", "mjxgrad optimise", [Block(text=str(self), drawings=drawings)])
+
+
+def _over_steps(name: str, values: Float[np.ndarray, "*seeds steps"]) -> Any:
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(4.6, 2.7), layout="constrained")
+    axis.plot(values.reshape(-1, values.shape[-1]).T, color="#0072b2", lw=1)
+    axis.set(xlabel="step", ylabel=name)
+    return figure

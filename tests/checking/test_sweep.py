@@ -1,5 +1,6 @@
 """A scene and a cost of a user's own, swept over contact stiffness by one line."""
 
+import html
 import math
 import re
 import sys
@@ -99,7 +100,8 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
 def test_the_page_has_answer_picture_table_and_sentence(swept):
     page = swept.as_html()
     assert f"<h1>{swept.headline}</h1>" in re.sub("</?span.*?>", "", page)
-    assert page.count("<svg role=") == 1
+    assert page.count("<svg role=") == 2  # bias and variance
+    assert html.escape(page) in swept._repr_html_()  # a notebook shows it in a frame
     assert '<td class="number">2500 (file)</td>' in page
     assert "h²k" in page.partition("</table>")[2]
 
@@ -111,6 +113,7 @@ def test_without_matplotlib_page_and_picture_say_what_brings_it(swept, monkeypat
         swept.as_html()
     with pytest.raises(ImportError, match="mjxgrad\\[render\\]"):
         swept.result.plot()
+    assert swept._repr_html_() is None  # a notebook then shows text
 
 
 def test_a_sweep_of_gymnasiums_pendulum_is_one_line(tmp_path, monkeypatch, capsys):
