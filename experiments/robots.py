@@ -56,7 +56,7 @@ _REACHES = (
     1.0,
 )  # of starts to either side, wider where the slope is not found or covers too few steps' phases
 _PHASES = (33, 129, 513, 2049)  # starts, and how many where fewer do not tell
-_LONGEST = 40.0  # s, after which no more starts are taken
+_LONGEST = 200.0  # s that more starts may take
 _WILD = 10.0  # scatter of single derivatives over the slope, from which flags are asked for
 _FEWEST_TEETH = 4  # steps' phases that starts must cover
 _OFF = 2e-3  # m or rad, beyond limits, open welds or deep in contact, from which a file does not begin at its pose
@@ -206,8 +206,8 @@ def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     shown: dict[str, Any] = {"steps": "off"}
     for reach in _REACHES:
         begin, shown["steps"] = time.perf_counter(), "off"
-        for count in _PHASES:  # each takes four times as long as the one before
-            if shown["steps"] in ("off", "consistent") and time.perf_counter() - begin < _LONGEST:
+        for count in _PHASES:  # each takes three times as long as all before
+            if shown["steps"] in ("off", "consistent") and 3 * (time.perf_counter() - begin) < _LONGEST:
                 outcomes, _, gradients = _along(model, scene, places := phases((-reach, reach), count))
                 found = compare_to_slope(places, outcomes, [gradients], ("slope",))
                 shown = {
