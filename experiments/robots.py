@@ -5,7 +5,6 @@ depend on is not wanted. Files are measured in processes of their own, where a c
 its first key frame or reference pose, moved by a thousandth, with small velocities and controls within their ranges: there no
 limit or contact is exactly at its surface, where a derivative has two values.
 
-- `mjx_motion`: the motion of one step of MJX's engine, in double precision, against `mj_step` of the file itself.
 - `c_*`, `mjx_*`: one step by either engine, in both precisions. The motion against `mj_step` of the file itself, and A and B, by
   reverse mode, against `mjd_transitionFD` (for RK4, which that refuses, central differences of `mj_step`). C's engine takes its
   own A and B from that function, so there the comparison is of what JAX makes of them.
@@ -63,8 +62,7 @@ _OFF = 2e-3  # m or rad, beyond limits, open welds or deep in contact, from whic
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
 # condition of contact, stiff rows on light bodies, up to 1e5; C's engine computes in double precision in any case.
 _LIMITS = {"c_single": (1e-4, 1e-6), "c_double": (1e-4, 1e-6), "mjx_double": (1e-4, 1e-6), "mjx_single": (1e-2, 1e-3)}
-_MOTION = "mjx_motion"
-PARTS = (*list(_LIMITS)[:2], "slope_single", _MOTION, *list(_LIMITS)[2:])
+PARTS = (*list(_LIMITS)[:2], "slope_single", *list(_LIMITS)[2:])
 _Start = tuple[np.ndarray, ...]  # qpos, qvel, act, ctrl
 _Results = dict[str, dict[str, dict[str, Any]]]  # by part and path
 
@@ -140,16 +138,6 @@ def _far(ours: Any, theirs: np.ndarray, least: float = np.finfo(float).tiny) -> 
     return float(np.abs(ours - theirs).max(initial=0.0) / np.abs(theirs).max(initial=least))
 
 
-def moved_once(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
-    """Return how far MJX's step is off C MuJoCo's, and whether it was flagged."""
-    start = start_of(model, scene.data.qpos.dtype)
-    after = by_differences(model, start)[0]
-    state = mg.initial_state(scene, *start[:3])
-    course = eqx.filter_jit(mg.rollout)(scene, state, start[3][None], contact=mg.Discrete("mjx"))
-    ends = (course.final.qpos, course.final.qvel, course.final.act)
-    return {"motion": max(map(_far, ends, after, (1.0, 1.0, 1.0))), "flagged": bool(course.diverged)}
-
-
 @eqx.filter_jit
 def _outcomes(scene: mg.Scene, start: _Start, line: tuple, places: jax.Array, measure_growth: bool) -> tuple:
     """Return how far positions have moved, NaN where flagged, whether that explodes, and derivatives by reverse mode."""
@@ -189,12 +177,10 @@ def settled(model: mujoco.MjModel, start: _Start) -> _Start:
     data, (qpos, qvel, act, ctrl) = mujoco.MjData(model), start
     data.qpos[:], data.act[:], data.ctrl[:] = qpos, act, ctrl
     mujoco.mj_forward(model, data)
-    kinds, limits = data.efc_type, (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
-    beyond = data.efc_pos[np.isin(kinds, limits)].min(initial=0.0), np.asarray(data.contact.dist).min(initial=0.0)
-    if (
-        max(*np.negative(beyond), np.abs(data.efc_pos[kinds == mujoco.mjtConstraint.mjCNSTR_EQUALITY]).max(initial=0.0))
-        > _OFF
-    ):
+    kind, kinds, reach = mujoco.mjtConstraint, data.efc_type, data.efc_pos
+    is_limit = np.isin(kinds, (kind.mjCNSTR_LIMIT_JOINT, kind.mjCNSTR_LIMIT_TENDON))
+    beyond = [-reach[is_limit], np.abs(reach[kinds == kind.mjCNSTR_EQUALITY]), -np.asarray(data.contact.dist)]
+    if np.concatenate(beyond).max(initial=0.0) > _OFF:
         for _ in range(int(1 / max(model.opt.timestep, 5e-4))):  # 1 s, without momentum
             mujoco.mj_step(model, data)
             data.qvel[:], data.act[:] = data.qvel / 2, act
@@ -204,21 +190,17 @@ def settled(model: mujoco.MjModel, start: _Start) -> _Start:
 def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:
     """Return the mean derivative of 50 steps by C's engine beside the slope of its own motion."""
     shown: dict[str, Any] = {"steps": "off"}
+    sizes = ("slope", "standard_error", "resolution", "spread", "error")
     for reach in _REACHES:
         begin, shown["steps"] = time.perf_counter(), "off"
         for count in _PHASES:  # each takes three times as long as all before
             if shown["steps"] in ("off", "consistent") and 3 * (time.perf_counter() - begin) < _LONGEST:
                 outcomes, _, gradients = _along(model, scene, places := phases((-reach, reach), count))
                 found = compare_to_slope(places, outcomes, [gradients], ("slope",))
-                shown = {
-                    name: _size(getattr(found, name))
-                    for name in ("slope", "standard_error", "resolution", "spread", "error")
-                }
-                shown |= {"scale": max(shown["slope"], _size(found.mean)), "starts": count, "reach": reach}
-                shown |= {
-                    "num_teeth": found.num_teeth[np.abs(found.error[0]).argmax()],
-                    "finite": int(found.num_finite.min()),
-                }
+                shown = {name: np.linalg.norm(getattr(found, name)).item() for name in sizes}
+                shown["scale"] = max(shown["slope"], np.linalg.norm(found.mean).item())
+                shown["num_teeth"] = found.num_teeth[np.abs(found.error[0]).argmax()].item()
+                shown |= {"starts": count, "reach": reach, "finite": int(found.num_finite.min())}
                 shown |= {"steps": judged(shown), "lost": int(np.sum(np.isfinite(outcomes) & ~np.isfinite(gradients)))}
         if shown["steps"] == "right" or (reach > _REACHES[0] and shown["steps"] != "ill-defined"):
             break
@@ -242,10 +224,6 @@ def judged(shown: dict[str, Any]) -> str:
     if not shown["error"] <= max(bar, 0.05 * shown["slope"], shown["resolution"]):
         return "ill-defined" if shown["num_teeth"] < _FEWEST_TEETH else "off"
     return "right" if bar <= max(size / 4, shown["resolution"]) else "consistent"
-
-
-def _size(vector: np.ndarray) -> float:
-    return float(np.linalg.norm(vector))
 
 
 def load(path: str, *, newton: bool = False) -> mujoco.MjModel:
@@ -277,8 +255,6 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
     if part == "c_single":
         _along(model, scene, np.zeros(1))
         found["seconds"] = round(time.perf_counter() - begin, 1)
-    if part == _MOTION:
-        return found | moved_once(model, scene)
     return found | one_step(model, scene, "mjx" if by_mjx else "mujoco")
 
 
@@ -353,8 +329,8 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
         return [f"off a slope of {found['slope']:.3g} by {found['error']:.3g} ± {2 * found['standard_error']:.2g}"]
     if verdict or found["flagged"]:
         return []
-    largest, farthest = _LIMITS.get(part, _LIMITS["mjx_double"])
-    wrong = [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found.get(name, 0.0) <= largest]
+    largest, farthest = _LIMITS[part]
+    wrong = [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found[name] <= largest]
     moves = f"motion is off by {found['motion']:.1g} without a warning"
     return wrong + [moves] * (not found["motion"] <= farthest and not found["warned"])
 

@@ -73,11 +73,7 @@ def test_they_touch_where_they_do_in_c(xml, num_contacts, num_places):
 
 @pytest.mark.parametrize(
     ("xml", "at", "close"),
-    [
-        (BOXES, [two_poses(7)], 1e-9),
-        (CAN, [*map(two_poses, range(4))], 1e-7),
-        (TILTED, [*map(poses, range(4))], 1e-6),
-    ],
+    [(BOXES, [two_poses(7)], 1e-9), (CAN, [*map(two_poses, range(4))], 1e-7), (TILTED, [*map(poses, range(4))], 1e-6)],
     ids=["boxes", "cylinder", "planes, balls and capsules"],
 )
 def test_contacts_have_the_derivative_of_their_points(xml, at, close):

@@ -15,15 +15,7 @@ import mjxgrad as mg
 from mjxgrad import envs
 from mjxgrad.learning import learner
 from mjxgrad.learning.networks import Network, Normaliser
-from mjxgrad.learning.window import (
-    Gradients,
-    Window,
-    _faded,
-    lambda_returns,
-    returned,
-    run_window,
-    window_gradients,
-)
+from mjxgrad.learning.window import Gradients, Window, _faded, lambda_returns, returned, run_window, window_gradients
 
 STEPS, STDDEV, DISCOUNT = 3, 0.3, 0.9  # of the windows that are run
 
