@@ -18,7 +18,7 @@ from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene, sensor
 from mjxgrad.stepping import Contact
 
-_STATES = ("qpos", "qvel", "act")
+STATES = ("qpos", "qvel", "act")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +196,7 @@ def coordinates(model: mjx.Model | mujoco.MjModel) -> list[slice]:
 
 
 def _width(scene: Scene, name: str) -> int:
-    if name in _STATES:
+    if name in STATES:
         return getattr(scene.data, name).shape[0]
     return jax.eval_shape(lambda: sensor(scene.model, scene.data, name)).shape[0]
 
@@ -205,7 +205,7 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
     """Return the state at time 0: the given one, else the first row; missing parts are the scene's pose, at rest."""
     if recording.start is not None:
         return recording.start
-    first = {name: recording.measured[name][0] for name in _STATES if name in recording.measured and times[0] == 0}
+    first = {name: recording.measured[name][0] for name in STATES if name in recording.measured and times[0] == 0}
     whole = {name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
     return initial_state(scene, **whole)
 
@@ -238,13 +238,13 @@ def simulated(
     if delay is not None:
         at = jnp.arange(len(controls), dtype=controls.dtype)
         controls = jax.vmap(lambda u: jnp.interp(at - delay / model.opt.timestep, at, u), 1, 1)(controls)
-    sensors = [name for name in window.measured if name not in _STATES]
+    sensors = [name for name in window.measured if name not in STATES]
 
     def observe(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
         return {name: sensor(model, data, name) for name in sensors}
 
     course = rollout(scene, state, controls, checkpoint=False, observe=observe if sensors else None, **settings)
-    return {name: getattr(course, name) for name in _STATES} | (course.observations or {}), course.diverged
+    return {name: getattr(course, name) for name in STATES} | (course.observations or {}), course.diverged
 
 
 def residuals(

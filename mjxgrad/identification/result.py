@@ -34,6 +34,7 @@ _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred tim
 _DEPARTS = 2.0  # of what is left of the fitted motions
 _BETTER = 0.8  # of the first residuals
 _CHANCE = 1e-4  # probability that residuals as large are noise
+_RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretell
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
 
 
@@ -66,6 +67,7 @@ class Identification(Printed):
         offsets: changes of the starts; None unless asked for.
         correlation: correlation of successive residuals of a signal, about 0 if only independent noise is left.
         removable: share of the sum of squares that the linear model at the end could still remove; 0 at a smooth minimum.
+        ruggedness: growth of the sum of squares a standard error away, over what its derivatives foretell; 1 where it is smooth.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
         stopped: the reason why the search ended.
@@ -89,6 +91,7 @@ class Identification(Printed):
     offsets: Float[np.ndarray, "windows _"] | None
     correlation: float
     removable: float
+    ruggedness: float
     num_numbers: int
     num_steps: int
     stopped: Stopped
@@ -163,16 +166,23 @@ class Identification(Printed):
                 "Jumps in the motion cause this: take contact=mg.Onset(), shorter windows or another start; doubt the intervals."
             )
         if self.has_noise and self._is_unexplained:
+            free = "" if self.offsets is not None else "free_start=True, "
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
-                "other first values, free_start=True, shorter windows (recording.cut) or more parameters, or correct the noise."
+                f"other first values, {free}shorter windows (recording.cut) or more parameters, or correct the noise."
             )
         left = max(self.rms[1], 1.0 if self.has_noise else _REMOVED * self.rms[0])
         if self.held_out_rms is not None and self.held_out_rms[1] > _DEPARTS * left:
             found.append(
                 f"What was held out departs ({self.held_out_rms[1]:.3g}): it is foretold from its first row, whose noise grows, "
-                "most where contacts chatter. Without it, the values may be right."
+                "most where contacts chatter."
+            )
+        if self.ruggedness > _RUGGED:
+            found.append(
+                f"The sum of squares is rugged: a standard error away it grows {format_number(self.ruggedness)} times as much as "
+                "its derivatives tell, as where contacts chatter. With an exact start the search finds the lowest minimum; with "
+                "a noisy first row values may be off by several intervals. Give start=, begin at rest, or record softer contact."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "

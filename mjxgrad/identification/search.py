@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
-from mjxgrad.identification.recording import Recording, Windows, residuals, stack
+from mjxgrad.identification.recording import STATES, Recording, Windows, residuals, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
@@ -42,6 +42,7 @@ _NUM_POINTS, _NUM_GENERATIONS = 256, 60  # of the search between the bounds
 _SHARE = 0.3
 _LEFT = 0.3  # of the first residuals
 _MISFIT = 10.0  # by which residuals that no descent lowers exceed the noise, where it is not known
+_NUM_AWAY, _CLEAR = 5, 1e-10  # points a standard error away; share of the largest curvature that counts
 _SIDE_BY_SIDE = 64  # points in one batch, for memory
 _DIVERGED = 1e30  # loss of a diverged motion
 _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
@@ -55,7 +56,7 @@ def identify(
     held_out: Sequence[Recording] = (),
     delay: str | None = None,
     free_start: bool = False,
-    contact: Contact = Discrete(),
+    contact: Contact | None = None,
     max_steps: int = 100,
     log: Log | None = None,
 ) -> Identification:
@@ -73,8 +74,9 @@ def identify(
         held_out: recordings for validation only.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
-        contact: as in `rollout`. The default is MuJoCo's motion, which recordings by MuJoCo need: the intervals do not cover
-            the error of another motion. `mg.Onset()` is a smoother motion, for recordings of real things.
+        contact: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need, for the intervals do not cover the
+            error of another one: by C MuJoCo where joints alone were measured; with sensors by MJX, which needs double
+            precision where contacts chatter. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of simulations with derivatives.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
@@ -106,6 +108,10 @@ def identify(
         importlib.import_module("optimistix")
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
+    if contact is None:
+        contact = Discrete(
+            "mujoco" if all(set(one.measured) <= set(STATES) for one in (*recordings, *held_out)) else None
+        )
     program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
     start = program.start()
     end = _descend(program, start, max_steps, log)
@@ -166,6 +172,7 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
         offsets=np.asarray(program.offsets(end.point)) if program.free_start else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
         removable=end.removable,
+        ruggedness=_ruggedness(program, end),
         num_numbers=numbers,
         num_steps=end.num_steps,
         stopped=Stopped.STALLED if stalls and end.stopped is Stopped.CONVERGED else end.stopped,
@@ -173,6 +180,23 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
         coordinates=coordinates,
         units={name: parameter.unit for name, parameter in program.parameters.items()},
     )
+
+
+def _ruggedness(program: "_Program", end: _End) -> float:
+    """Return how a standard error away the sum of squares grows, over what its derivatives foretell: 1 where it is smooth."""
+    if end.stopped is Stopped.INTERRUPTED:
+        return 1.0
+    _, residual, slope = (np.asarray(x, float) for x in _linear_model(program, end.found, end.point, 1.0))
+    sizes, axes = np.linalg.eigh(slope.T @ slope)
+    is_clear, total = sizes > _CLEAR * sizes.max(), float(residual @ residual)
+    lengths = np.where(is_clear, np.sqrt(total / program.num_numbers / np.where(is_clear, sizes, 1.0)), 0.0)
+    growth = []
+    for draw in np.random.default_rng(0).normal(size=(_NUM_AWAY, len(sizes))):
+        change = axes @ (lengths * draw)
+        there = program(jnp.asarray(end.point + change, end.point.dtype))[0]
+        foretold = np.sum((slope @ change) ** 2) + np.finfo(float).tiny
+        growth.append((float(jnp.sum(there**2)) - total) / foretold)
+    return float(np.median(growth))
 
 
 class _Program:

@@ -105,7 +105,9 @@ def test_one_parameter_and_its_interval_are_those_of_the_regression(cart):
     np.testing.assert_allclose(result.rms[1], np.sqrt(((measured - expected * course) ** 2).mean()) / 0.02, rtol=1e-6)
     left = (expected * course[:3] - 3.3 * course[:3] - 0.06) / 0.02
     np.testing.assert_allclose(result.held_out_rms[1], np.sqrt((left**2).mean()), rtol=1e-3)
+    np.testing.assert_allclose(result.ruggedness, 1.0, rtol=0.05)  # the sum of squares is a parabola
     assert "gear" in result.summary()
+    assert "rugged" not in result.summary()
     bounded = mg.identify(cart, {"gear": identification.gear(cart, "motor", bounds=(1.0, 3.1))}, [recording])
     np.testing.assert_allclose(bounded.values["gear"], 3.1)
     assert bounded.at_bounds == ("gear",)
@@ -194,6 +196,8 @@ def test_through_a_bounce_a_descent_stalls_without_an_onset_and_the_search_goes_
     monkeypatch.setattr("mjxgrad.identification.search._Program.searched", lambda program, loss: program.start())
     alone = mg.identify(scene, {"height": Parameter(0.3, 0.1, 0.5, raised)}, [recording], contact=mg.Discrete())
     assert alone.stopped is Stopped.STALLED
+    assert alone.ruggedness > 10
+    assert "is rugged" in alone.summary()
     assert abs(alone.values["height"] - 0.25) > 0.03
 
 
