@@ -26,7 +26,8 @@ class Paged(Printed):
             page = self.as_html()  # pyright: ignore[reportAttributeAccessIssue]
         except ImportError:
             return None
-        return f'<iframe srcdoc="{html.escape(page)}" style="width: 100%; height: 40em; border: 0"></iframe>'
+        fit = "this.style.height = this.contentDocument.documentElement.scrollHeight + 'px'"
+        return f'<iframe srcdoc="{html.escape(page)}" onload="{fit}" style="width: 100%; height: 40em; border: 0"></iframe>'
 
 
 def name_pairs(pairs: Sequence[object]) -> str:

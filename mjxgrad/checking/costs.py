@@ -76,8 +76,10 @@ def _told(name: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if isinstance(error, jax.errors.TracerArrayConversionError):
-            raise ValueError(f"cost {name!r} must compute with jax.numpy, got NumPy on traced numbers") from error
+        if isinstance(error, jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError):
+            raise ValueError(
+                f"cost {name!r} must compute with jax.numpy, got NumPy, float() or if on traced numbers"
+            ) from error
         forms = "file.py:function, module:function, or of a body as height:torso"
         raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}; a cost must be {forms}") from error
 

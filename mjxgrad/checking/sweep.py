@@ -108,6 +108,12 @@ def _in_pairs(objective: Any, direction: Float[Array, " nu"], keys: Key[Array, "
     return jax.lax.map(quotient, keys, batch_size=_PAIRS)
 
 
+def _by_mujoco(task: SceneTask) -> SceneTask:
+    """Return a task whose own motion, where that is MuJoCo's, is C MuJoCo's, which compiles nothing."""
+    is_own = isinstance(task.contact, Slope | Discrete)
+    return eqx.tree_at(lambda one: one.contact, task, Discrete("mujoco")) if is_own else task
+
+
 def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1"]) -> Float[Array, ""]:
     start = eqx.tree_at(lambda state: state.qvel, task.state, task.state.qvel + speed[0] * along)
     return task.run(jnp.zeros((task.horizon, 0)), start=start).cost
@@ -164,9 +170,7 @@ class Knob:
         density of the half width r being Maxwell's, $r^2 \varphi(r/\sigma)/\sigma^3$, the mean of (f(r) − f(−r)) / 2r is the
         slope of the smoothed cost, for any f (Stein's identity). Where f is linear it does not scatter at all.
         """
-        task = self.task
-        if isinstance(task.contact, Slope | Discrete):  # the motion is MuJoCo's, which compiles nothing
-            task = eqx.tree_at(lambda one: one.contact, task, Discrete("mujoco"))
+        task = _by_mujoco(self.task)
         objective = dataclasses.replace(self, task=task)(softness)
         keys = jax.random.split(key, num_rollouts // 2)
         # The shift moves the noise's part along it by the root of so many steps, over its deviation.
@@ -275,6 +279,8 @@ def sweep(
     function("log", log, "text")
     scene = source if isinstance(source, Scene) else load_scene(source)
     task = scene_task(scene, cost, seed=seed, **task_settings)
+    if not np.isfinite(at_rest := _by_mujoco(task).run(None).cost):
+        raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     result = bias_variance(

@@ -106,6 +106,7 @@ def svg(draw: Callable[[], Any], label: str) -> str:
     import matplotlib.pyplot as plt
     from markupsafe import escape
 
+    plt.close(plt.figure())  # loads the backend, whose settings the end of the context would undo
     with plt.style.context([STYLE, {"svg.hashsalt": label}]), io.StringIO() as file:
         figure = draw()
         figure.savefig(

@@ -9,6 +9,7 @@ from mjxgrad import identification
 
 _FRICTION, _MASS, _NOISE = 0.6, 1.3, 0.01  # m/s
 _CONTROLS = np.sin(np.arange(200) / 8)[:, None]
+_SOFT = 'solimp="0 .95 .002"'
 _BOX = """<mujoco><option timestep=".005"/><default><geom {}/></default><worldbody><geom type="plane" size="5 5 .1"/>
   <body name="box" pos="0 0 .05"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
   <joint name="z" type="slide" axis="0 0 1"/>{}<geom type="box" size=".1 .05 .05" mass="1"/></body></worldbody>
@@ -34,11 +35,16 @@ def _speeds(xml: str) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("contact", "turn"),
-    [("", ""), ('solimp="0 .95 .002"', ""), ("", '<joint axis="0 1 0"/>')],
-    ids=["default contact, which chatters", "soft contact", "default contact, corner by corner"],
+    ("contact", "turn", "is_exact"),
+    [("", "", True), (_SOFT, "", True), (_SOFT, "", False), ("", '<joint axis="0 1 0"/>', True)],
+    ids=[
+        "default contact, which chatters",
+        "soft contact",
+        "noisy starts, soft contact",
+        "default contact, corner by corner",
+    ],
 )
-def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn):
+def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn, is_exact):
     """Of 20 intervals that hold with 95 %, 17 or more do with a chance of 98 %. The residuals are then the noise.
 
     A box that turns chatters corner by corner: friction that is 0.2 % off has other motions after twenty steps.
@@ -48,14 +54,13 @@ def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn)
     covered = np.zeros(2, int)
     for seed in range(20):
         measured = true + _NOISE * np.random.default_rng(seed).normal(size=true.shape)
-        recording = identification.Recording(
-            {"qvel": measured}, _CONTROLS, noise={"qvel": _NOISE}, start=mg.initial_state(scene)
-        )
+        start = mg.initial_state(scene) if is_exact else None
+        recording = identification.Recording({"qvel": measured}, _CONTROLS, noise={"qvel": _NOISE}, start=start)
         parameters = {"friction": identification.friction(scene), "mass": identification.mass(scene, "box")}
-        result = mg.identify(scene, parameters, [recording])
+        result = mg.identify(scene, parameters, [recording], free_start=not is_exact)
         error = np.array([result.values["friction"] - _FRICTION, result.values["mass"] - _MASS])
         half = np.array([result.half_width["friction"], result.half_width["mass"]])
         covered += np.abs(error) <= half
         assert result.rms[1] < 1.2, result.summary()
-        assert not result.warnings()
+        assert ["rugged" in warning for warning in result.warnings()] == [True] * (contact != _SOFT)
     assert (covered >= 17).all(), covered

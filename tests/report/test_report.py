@@ -1,6 +1,10 @@
 """Pages and figures: what stands in them is text, and they fit light and dark."""
 
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -56,3 +60,16 @@ def test_two_figures_of_a_page_share_no_name_and_fetch_nothing():
 @pytest.mark.parametrize(("width", "is_wide"), [(4, False), (11, True)])
 def test_only_a_wide_figure_keeps_its_width_on_a_telephone(width, is_wide):
     assert ('class="wide"' in svg(lambda: figure(size=(width, 2)), "a")) is is_wide
+
+
+def test_a_notebooks_backend_keeps_what_it_sets_when_a_page_is_the_first_to_draw(tmp_path):
+    """Backends such as that of notebooks switch interactive drawing on; without it later figures are not shown."""
+    (tmp_path / "shown.py").write_text(
+        "from matplotlib.backends.backend_agg import *\nimport matplotlib\nmatplotlib.interactive(True)\n"
+    )
+    code = "import matplotlib; from mjxgrad.report import svg; import importlib"
+    code += (
+        "; svg(lambda: importlib.import_module('matplotlib.pyplot').figure(), 'a'); assert matplotlib.is_interactive()"
+    )
+    environment = os.environ | {"MPLBACKEND": "module://shown", "PYTHONPATH": f"{tmp_path}:{Path.cwd()}"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
