@@ -75,8 +75,8 @@ def identify(
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
         contact: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need, for the intervals do not cover the
-            error of another one: by C MuJoCo where joints alone were measured; with sensors by MJX, which needs double
-            precision where contacts chatter. `mg.Onset()` is a smoother motion, for recordings of real things.
+            error of another one: by MJX, but in single precision by C MuJoCo where joints alone were measured, since contacts
+            that chatter need double precision. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of simulations with derivatives.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
@@ -109,9 +109,8 @@ def identify(
     except ImportError as error:
         raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     if contact is None:
-        contact = Discrete(
-            "mujoco" if all(set(one.measured) <= set(STATES) for one in (*recordings, *held_out)) else None
-        )
+        has_sensors = any(set(one.measured) - set(STATES) for one in (*recordings, *held_out))
+        contact = Discrete(None if has_sensors or scene.data.qpos.dtype == np.float64 else "mujoco")
     program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
     start = program.start()
     end = _descend(program, start, max_steps, log)
