@@ -279,7 +279,8 @@ def sweep(
     function("log", log, "text")
     scene = source if isinstance(source, Scene) else load_scene(source)
     task = scene_task(scene, cost, seed=seed, **task_settings)
-    if not np.isfinite(at_rest := _by_mujoco(task).run(None).cost):
+    own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
+    if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
