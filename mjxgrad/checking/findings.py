@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
+from mjxgrad.batched import device
 from mjxgrad.checking.measure import STDDEVS, Measured
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
@@ -40,7 +41,7 @@ class Finding:
 
 def chosen(gradient: str) -> str:
     """Return a gradient as an argument: by C MuJoCo's engine, which compiles nothing, but on GPUs, where MJX is faster."""
-    engine = '"mujoco"' if jax.default_backend() == "cpu" else ""
+    engine = '"mujoco"' if device.is_cpu() else ""
     return f"contact=mg.{gradient.title()}({engine})"
 
 

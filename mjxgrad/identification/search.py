@@ -75,8 +75,8 @@ def identify(
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
         contact: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need, for the intervals do not cover the
-            error of another one: by MJX, but in single precision by C MuJoCo where joints alone were measured, since contacts
-            that chatter need double precision. `mg.Onset()` is a smoother motion, for recordings of real things.
+            error of another one. It is by MJX, but in single precision by C MuJoCo where joints alone were measured, since
+            chattering contacts need double precision. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of simulations with derivatives.
         log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
 
