@@ -181,8 +181,8 @@ class Identification(Printed):
         if self.ruggedness > _RUGGED:
             found.append(
                 f"The sum of squares is rugged: a standard error away it grows {format_number(self.ruggedness)} times as much as "
-                "its derivatives tell, as where contacts chatter, and has many minima. Values may be off by several intervals, above "
-                "all with a noisy first row: give an exact start, several recordings, or soften the contact."
+                "its derivatives tell, as where contacts chatter, and has many minima. Values may be off by several intervals, "
+                "above all with a noisy first row: give an exact start, several recordings, or soften the contact."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
