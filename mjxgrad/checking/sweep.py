@@ -161,6 +161,13 @@ class Knob:
         half = jnp.asarray(half_range(scene), like)
         return CommonShift(task, self.noise * half, dim=1, direction=half * along)  # pyright: ignore[reportCallIssue]
 
+    @functools.cached_property
+    def _traced(self) -> Callable[[Softness], Objective]:
+        """The same by C MuJoCo where the motion is MuJoCo's; traced, so that warnings are not repeated."""
+        knob = dataclasses.replace(self, task=_by_mujoco(self.task))
+        _ = knob.own, knob.direction  # kept, since a trace does not know them
+        return eqx.filter_jit(lambda softness: knob(softness))
+
     def truth(
         self, softness: Softness, key: PRNGKeyArray, num_rollouts: int
     ) -> tuple[Float[np.ndarray, "1 1"], Float[np.ndarray, "1 1"]]:
@@ -170,11 +177,10 @@ class Knob:
         density of the half width r being Maxwell's, $r^2 \varphi(r/\sigma)/\sigma^3$, the mean of (f(r) − f(−r)) / 2r is the
         slope of the smoothed cost, for any f (Stein's identity). Where f is linear it does not scatter at all.
         """
-        task = _by_mujoco(self.task)
-        objective = dataclasses.replace(self, task=task)(softness)
+        objective = self._traced(softness)
         keys = jax.random.split(key, num_rollouts // 2)
         # The shift moves the noise's part along it by the root of so many steps, over its deviation.
-        scale = np.sqrt(task.horizon) / self.noise
+        scale = np.sqrt(self.task.horizon) / self.noise
         slopes = scale * np.asarray(_in_pairs(objective, jnp.asarray(self.direction), keys), float)  # pyright: ignore[reportCallIssue]
         slopes = slopes[np.isfinite(slopes)]
         error = slopes.std(ddof=1) / np.sqrt(len(slopes)) if len(slopes) > 1 else np.nan

@@ -136,7 +136,7 @@ class Surfaces:
         """Widen all margins by what states of these speeds travel in half a step, at most."""
         self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
         self.longest = max(1.0, self.lengths.max(initial=0.0))
-        self.kept = 1 / (1 + model.opt.timestep * model.dof_damping * model.dof_invweight0)
+        self.kept = kept_by_damping(model)
         # How far ahead of the start of a step its stages lie, in the mean (s).
         self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
         travel = (0.5 * self.timestep + 2 * self.lead) * np.max(np.abs(speeds), axis=0, initial=0.0)
@@ -230,6 +230,11 @@ class Surfaces:
             _LEAST_WIDTH * width,
             first_impedance > _NO_JUMP,
         )
+
+
+def kept_by_damping(model: mujoco.MjModel) -> Float[np.ndarray, " nv"]:
+    """Return how much of each velocity damping leaves after a step."""
+    return 1 / (1 + model.opt.timestep * model.dof_damping * model.dof_invweight0)
 
 
 def widened(model: mujoco.MjModel, contact: float, limit: float) -> mujoco.MjModel:
