@@ -17,7 +17,7 @@ import numpy as np
 from mjxgrad._text import write
 from mjxgrad.identification import parameters
 from mjxgrad.identification.parameters import Parameter
-from mjxgrad.identification.recording import Recording, coordinates, start_of
+from mjxgrad.identification.recording import Recording, coordinates
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
@@ -128,8 +128,7 @@ def recording(
         scale = _stated(scene, found, noise, str(path))
     at = times - times[0]
     driven = {"controls": controls, "control_times": at} if scene.model.nu else {}
-    made = Recording(found, times=at, noise=scale, knows_noise=bool(noise), name=str(path), **driven)
-    return dataclasses.replace(made, start=start_of(scene, made, at)), tuple(unknown)
+    return Recording(found, times=at, noise=scale, knows_noise=bool(noise), name=str(path), **driven), tuple(unknown)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -254,7 +253,8 @@ def hold_out(recordings: Sequence[Recording], share: float) -> tuple[list[Record
     is_late = times > (1 - share) * times[-1]
     early = {name: value[~is_late] for name, value in whole.measured.items()}
     # The end starts where the recording does: positions and speeds in the middle may be unmeasured.
-    late = {name: np.where(is_late[:, None], value, np.nan) for name, value in whole.measured.items()}
+    is_kept = is_late | (times == times[0])
+    late = {name: np.where(is_kept[:, None], value, np.nan) for name, value in whole.measured.items()}
     fitted = dataclasses.replace(whole, measured=early, times=times[~is_late])
     return [fitted], [dataclasses.replace(whole, measured=late)]
 

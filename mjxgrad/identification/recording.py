@@ -185,6 +185,24 @@ def _window(
     )
 
 
+def spread(scene: Scene, recordings: Sequence[Recording], free_start: bool | None) -> Float[np.ndarray, "windows both"]:
+    """Return the noise of each start, positions and velocities (m, rad, m/s, rad/s), where its numbers were measured.
+
+    A start that was given is exact unless all starts are free.
+    """
+    found = np.zeros((len(recordings), 2, scene.model.nv))
+    for spread, one in zip(found, recordings, strict=True):
+        is_noisy = one.start is None if free_start is None else free_start
+        for row, name in zip(spread, ("qpos", "qvel"), strict=True):
+            if is_noisy and name in one.measured and _times(one, float(scene.model.opt.timestep))[0] == 0:
+                is_there = np.isfinite(one.measured[name][0])
+                if name == "qpos":
+                    is_there = np.array([is_there[numbers].all() for numbers in coordinates(scene.model)])
+                noise = np.asarray(one.noise.get(name, 1.0), float)
+                row[:] = np.where(is_there & np.isfinite(noise), noise, 0.0)
+    return found.reshape(len(recordings), -1)
+
+
 def coordinates(model: mjx.Model | mujoco.MjModel) -> list[slice]:
     """Return for each velocity the numbers of a position that it changes: one, or all four of a quaternion."""
     found, (ball, free) = [], (int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE))

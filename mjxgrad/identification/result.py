@@ -22,6 +22,7 @@ import scipy.special
 from jaxtyping import Float
 
 from mjxgrad._text import Printed, aligned, format_number, write
+from mjxgrad.identification.ensemble import MISFIT
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
@@ -34,7 +35,6 @@ _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred tim
 _DEPARTS = 2.0  # of what is left of the fitted motions
 _BETTER = 0.8  # of the first residuals
 _CHANCE = 1e-4  # probability that residuals as large are noise
-_RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretell
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
 
 
@@ -64,10 +64,11 @@ class Identification(Printed):
         rms: root mean square of the residuals in units of the noise, before and after; about 1 if noise and model are right.
         has_noise: whether the recordings state the noise of every signal.
         held_out_rms: the same for the held-out recordings; None without any.
-        offsets: changes of the starts; None unless asked for.
+        offsets: changes of the starts; None where they are known, or where many motions were fitted.
         correlation: correlation of successive residuals of a signal, about 0 if only independent noise is left.
         removable: share of the sum of squares that the linear model at the end could still remove; 0 at a smooth minimum.
-        ruggedness: growth of the sum of squares a standard error away, over what its derivatives foretell; 1 where it is smooth.
+        num_motions: 1, or the number of motions whose mean was fitted since contacts chatter; residuals are then those of the
+            mean, over the covariance of noise and chatter.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
         stopped: the reason why the search ended.
@@ -91,7 +92,7 @@ class Identification(Printed):
     offsets: Float[np.ndarray, "windows _"] | None
     correlation: float
     removable: float
-    ruggedness: float
+    num_motions: int
     num_numbers: int
     num_steps: int
     stopped: Stopped
@@ -107,6 +108,8 @@ class Identification(Printed):
 
     @property
     def _is_unexplained(self) -> bool:
+        if self.has_noise and self.num_motions > 1:
+            return self.rms[1] > MISFIT
         if self.has_noise:
             return exceeds_noise(self.rms[1], self.num_numbers - len(self.names))
         return any(after > _BETTER * before for before, after in (self.rms, self.held_out_rms or (1, 0)))
@@ -139,6 +142,8 @@ class Identification(Printed):
         rms = f"Residuals, in {unit}: {self.rms[0]:.3g} at the start, {self.rms[1]:.3g} now"
         if self.held_out_rms is not None:
             rms += f"; held out: {self.held_out_rms[0]:.3g} and {self.held_out_rms[1]:.3g}"
+        if self.num_motions > 1:
+            rms += f". Contacts chatter: the mean of {self.num_motions} motions is fitted, and error and intervals allow for it"
         warnings = [f"\n{line}" for line in self.warnings()]
         return "\n".join([f"{head}, {self.stopped.value}.", f"{rms}.", "", *aligned(self.rows()), *warnings])
 
@@ -166,7 +171,7 @@ class Identification(Printed):
                 "Jumps in the motion cause this: take contact=mg.Onset(), shorter windows or another start; doubt the intervals."
             )
         if self.has_noise and self._is_unexplained:
-            free = "" if self.offsets is not None else "free_start=True, "
+            free = "" if self.offsets is not None or self.num_motions > 1 else "free_start=True, "
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
@@ -177,12 +182,6 @@ class Identification(Printed):
             found.append(
                 f"What was held out departs ({self.held_out_rms[1]:.3g}): it is foretold from its first row, whose noise grows, "
                 "most where contacts chatter."
-            )
-        if self.ruggedness > _RUGGED:
-            found.append(
-                f"The sum of squares is rugged: a standard error away it grows {format_number(self.ruggedness)} times as much as "
-                "its derivatives tell, as where contacts chatter, and has many minima. Values may be off by several intervals, "
-                "above all with a noisy first row: give an exact start, several recordings, or soften the contact."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
             starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "

@@ -2,12 +2,14 @@ r"""The search: residuals of all recordings in one program, their derivative in 
 
 One program rolls out all windows of a scene under `jax.vmap`, with one tangent per parameter. The unknown start of a window
 affects that window alone, so the tangents of the starts do not grow with the number of windows. Each step of the search asks
-this program for residuals and derivative at one point, and optimistix chooses the next by their linear model.
+this program for residuals and derivative at one point, and optimistix chooses the next by their linear model. Where no single
+motion fits, or the sum of squares is rugged, the values are those of an ensemble.
 """
 
 import contextlib
 import functools
 import importlib
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,13 +18,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, Float
 
 from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
+from mjxgrad.identification.ensemble import Ensemble, fit
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
-from mjxgrad.identification.recording import STATES, Recording, Windows, residuals, stack
+from mjxgrad.identification.recording import STATES, Recording, Windows, residuals, spread, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
@@ -37,14 +39,11 @@ _FIRST_SIZE = 3.0  # with less, the first step may go too far to recover
 _GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix's 0.99 keeps it too long
 # Least gain as a share of the noise variance, and steps in a row below it: badly determined parameters make it creep.
 _TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
-_NUM_POINTS, _NUM_GENERATIONS = 256, 60  # of the search between the bounds
-# Scale of the robust loss, of the noise: of 12 boxes that turn it finds all with 0.3, 10 with 1 or 0.1 and 5 with 10.
-_SHARE = 0.3
 _LEFT = 0.3  # of the first residuals
-_MISFIT = 10.0  # by which residuals that no descent lowers exceed the noise, where it is not known
 _NUM_AWAY, _CLEAR = 5, 1e-10  # points a standard error away; share of the largest curvature that counts
-_SIDE_BY_SIDE = 64  # points in one batch, for memory
-_DIVERGED = 1e30  # loss of a diverged motion
+_RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretell
+_BETTER, _ALONE = 1.1, 0.5  # the residuals, the sum of squares of one motion, over the ensemble's at most
+_MOST_AT_ONCE, _SIDE_BY_SIDE = 256, 64  # motions in one call, and in one batch, for memory
 _NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
 
 
@@ -55,7 +54,7 @@ def identify(
     *,
     held_out: Sequence[Recording] = (),
     delay: str | None = None,
-    free_start: bool = False,
+    free_start: bool | None = None,
     contact: Contact | None = None,
     max_steps: int = 100,
     log: Log | None = None,
@@ -63,9 +62,9 @@ def identify(
     r"""Identify parameters of a scene from recorded motions, through contact.
 
     Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
-    derivatives through the simulation. Where it leaves more than the stated noise, as where contacts chatter, a second
-    descent begins where differential evolution of a robust loss ends between the bounds. Ctrl-C ends the search with the best
-    values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
+    derivatives through the simulation. Where contacts chatter, no motion fits: then the mean of many motions is fitted,
+    between the bounds, with starts as noisy as they were measured, and the intervals include the chatter. Ctrl-C ends the
+    search with the best values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
 
     Args:
         scene: the scene with nominal values.
@@ -73,12 +72,13 @@ def identify(
         recordings: recordings of the scene.
         held_out: recordings for validation only.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
-        free_start: whether to identify the start of every recording, too, for starts as noisy as the rest.
+        free_start: whether the starts are unknown, too. None is for those that are the first row of a recording, as far as it
+            was measured, and as noisy; True is for all; with False all are exact.
         contact: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need, for the intervals do not cover the
             error of another one. It is by MJX, but in single precision by C MuJoCo where joints alone were measured, since
             chattering contacts need double precision. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of simulations with derivatives.
-        log: called after each step as `log(step, {"rms": ..., "is_accepted": ...})`.
+        log: called after each step, or ensemble of motions, as `log(step, {"rms": ..., "is_accepted": ...})`.
 
     Returns:
         The values, their intervals, and undetermined parameters; `print(result.summary())`.
@@ -103,7 +103,7 @@ def identify(
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     max_steps = whole("max_steps", max_steps)
     function("log", log, "step", "metrics")
-    instance("free_start", free_start, bool, "True or False")
+    instance("free_start", free_start, bool | None, "True, False or None")
     try:  # before anything is compiled
         importlib.import_module("optimistix")
     except ImportError as error:
@@ -115,15 +115,32 @@ def identify(
     start = program.start()
     end = _descend(program, start, max_steps, log)
     has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
-    if _is_off(program, end, has_noise) and end.stopped is not Stopped.INTERRUPTED:
-        noise = 1.0 if has_noise else _rms(program, end.found) / _MISFIT
-        loss, again = functools.partial(_robust, scale=_SHARE * noise), end._replace(stopped=Stopped.INTERRUPTED)
-        with contextlib.suppress(KeyboardInterrupt):
-            again = _descend(program, program.searched(loss), max_steps, log)
-        end = end._replace(stopped=again.stopped if again.stopped is Stopped.INTERRUPTED else end.stopped)
-        if loss(again.found[0]) < loss(end.found[0]):
-            end = again._replace(first=end.first, num_steps=end.num_steps + again.num_steps, is_searched=True)
-    return _identified(program, end, held_out, has_noise)
+    if end.stopped is Stopped.INTERRUPTED:
+        return _identified(program, end, None, held_out, has_noise)
+    many = None
+    try:
+        is_rugged = _ruggedness(program, end) > _RUGGED
+        if is_rugged or _is_off(program, end, has_noise):
+            many = _ensemble(program, 1.0 if has_noise else None, end.num_steps, log)
+            rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
+            is_alone = float(jnp.sum(end.found[0] ** 2)) < _ALONE * many.least or not is_rugged
+            if _rms(program, end.found) < _BETTER * rms and is_alone:
+                many = None
+    except KeyboardInterrupt:
+        end = end._replace(stopped=Stopped.INTERRUPTED)
+    return _identified(program, end, many, held_out, has_noise)
+
+
+def _ensemble(program: "_Program", noise: float | None, num_steps: int, log: Log | None) -> Ensemble:
+    steps = itertools.count(num_steps + 1)
+
+    def say(rms: float) -> None:
+        if log is not None:
+            log(next(steps), {"rms": rms, "is_accepted": 1.0})
+
+    box = [np.where(np.isfinite(x), x, sign) for x, sign in zip(program.coordinates.box(), (-1.0, 1.0), strict=True)]
+    run = lambda points, draws: program.motions(program.windows, points, draws * program.spread)  # noqa: E731
+    return fit(run, (box[0], box[1]), program.spread.shape, program.num_numbers, noise, say)
 
 
 def _is_off(program: "_Program", end: "_End", has_noise: bool) -> bool:
@@ -144,19 +161,29 @@ class _End(NamedTuple):
     stopped: Stopped
     first: float  # root mean square of the residuals at the start
     removable: float  # share of the sum of squares that the linear model would still remove
-    is_searched: bool = False  # whether it began where the search between the bounds ended
 
 
-def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], has_noise: bool) -> Identification:
-    """Return the values at the end of a search, with all that the recordings tell of them."""
+def _identified(
+    program: "_Program", end: _End, many: Ensemble | None, held_out: Sequence[Recording], has_noise: bool
+) -> Identification:
+    """Return the values at the end of a search, or of an ensemble, with all that the recordings tell of them."""
     coordinates, numbers = program.coordinates, program.num_numbers
-    values = np.asarray(coordinates.values(end.point[: len(coordinates.names)]), float)
-    explained = on_host(end.found)
-    residual, slope, num_offsets = _without_offsets(*explained)
-    signals = explained[0].reshape(*program.windows.index.shape, -1)
+    count, stopped, removable = len(coordinates.names), end.stopped, end.removable
+    if many is None:
+        point, (residual, slope, num_offsets) = end.point[:count], _without_offsets(*on_host(end.found))
+        signals = np.asarray(end.found[0], float)
+        if removable > _STALLED and _is_off(program, end, has_noise) and stopped is Stopped.CONVERGED:
+            stopped = Stopped.STALLED
+    else:
+        point, signals, residual, num_offsets = jnp.asarray(many.point), many.residual, many.residual, 0
+        slope, removable = many.slope / np.asarray(coordinates.scale, float), 0.0
+        stopped = (
+            stopped if stopped is Stopped.INTERRUPTED else Stopped.CONVERGED if many.is_settled else Stopped.STALLED
+        )
+    values = np.asarray(coordinates.values(point.astype(coordinates.nominal.dtype)), float)
+    signals = signals.reshape(*program.windows.index.shape, -1)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
-    stalls = end.removable > _STALLED and not end.is_searched and _is_off(program, end, has_noise)
     nominal = np.asarray(coordinates.nominal, float)
     is_at_bound = coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype))
     return Identification(
@@ -167,14 +194,16 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
         rms=(end.first, float(np.linalg.norm(residual) / np.sqrt(numbers))),
         has_noise=has_noise,
-        held_out_rms=None if end.stopped is Stopped.INTERRUPTED else program.held_out_rms(held_out, nominal, values),
-        offsets=np.asarray(program.offsets(end.point)) if program.free_start else None,
+        held_out_rms=None
+        if stopped is Stopped.INTERRUPTED
+        else program.held_out_rms(held_out, end.point[:count], many),
+        offsets=program.offsets(end.point) if many is None else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
-        removable=end.removable,
-        ruggedness=_ruggedness(program, end),
+        removable=removable,
+        num_motions=1 if many is None else len(many.points),
         num_numbers=numbers,
         num_steps=end.num_steps,
-        stopped=Stopped.STALLED if stalls and end.stopped is Stopped.CONVERGED else end.stopped,
+        stopped=stopped,
         scene=program.put(program.nominal, jnp.asarray(values, coordinates.nominal.dtype)),
         coordinates=coordinates,
         units={name: parameter.unit for name, parameter in program.parameters.items()},
@@ -183,8 +212,6 @@ def _identified(program: "_Program", end: _End, held_out: Sequence[Recording], h
 
 def _ruggedness(program: "_Program", end: _End) -> float:
     """Return how a standard error away the sum of squares grows, over what its derivatives foretell: 1 where it is smooth."""
-    if end.stopped is Stopped.INTERRUPTED:
-        return 1.0
     _, residual, slope = (np.asarray(x, float) for x in _linear_model(program, end.found, end.point, 1.0))
     sizes, axes = np.linalg.eigh(slope.T @ slope)
     is_clear, total = sizes > _CLEAR * sizes.max(), float(residual @ residual)
@@ -207,22 +234,28 @@ class _Program:
         recordings: Sequence[Recording],
         parameters: Mapping[str, Parameter],
         *,
-        free_start: bool,
+        free_start: bool | None,
         delay: str | None,
         contact: Contact,
     ):
         self.nominal, self.parameters, self.coordinates = scene, parameters, Coordinates.of(parameters)
         self.free_start, self._delay, self._contact = free_start, delay, contact
+        self.spread = spread(scene, recordings, free_start)
+        # One unknown for each noisy number of a start, in units of its noise, or for all of them.
+        sizes = np.ones_like(self.spread) if free_start else self.spread
+        self._free = np.flatnonzero(sizes.any(axis=0))
+        self._sizes = jnp.asarray(sizes[:, self._free], self.coordinates.nominal.dtype)
         self.windows = stack(scene, recordings)
         self.num_numbers = _num_numbers(self.windows)
         if not self.num_numbers:
             raise ValueError("recordings must hold something that was measured, got NaN alone")
-        self._compiled: dict[Callable, jax.stages.Compiled] = {}
+        self._compiled: dict[Any, jax.stages.Compiled] = {}
 
     def _run(self, function: Callable, *arguments: Any) -> Any:
-        if function not in self._compiled:
-            self._compiled[function] = compile_once(jax.jit(function).lower(*arguments))
-        return self._compiled[function](*arguments)
+        key = function, *(leaf.shape for leaf in jax.tree.leaves(arguments))
+        if key not in self._compiled:
+            self._compiled[key] = compile_once(jax.jit(function).lower(*arguments))
+        return self._compiled[key](*arguments)
 
     def put(self, scene: Scene, vector: Array) -> Scene:
         """Return the scene with these values."""
@@ -234,88 +267,73 @@ class _Program:
         residual, diverged = residuals(scene, window, offset, delay, contact=self._contact)
         return jnp.where(diverged, jnp.inf, residual)
 
-    def _traced(self, windows: Windows, vector: Array, offsets: Array | None) -> tuple[Array, ...]:
-        def one(window: Windows, offset: Array | None) -> tuple[Array, ...]:
-            def both(vector: Array, offset: Array | None) -> tuple[Array, Array]:
-                residual = self._residuals(vector, offset, window)
+    def _traced(self, windows: Windows, vector: Array, starts: Array, sizes: Array) -> tuple[Array, ...]:
+        def one(window: Windows, start: Array, size: Array) -> tuple[Array, ...]:
+            def both(vector: Array, start: Array) -> tuple[Array, Array]:
+                residual = self._residuals(vector, self._change(start * size), window)
                 return residual, residual
 
-            slopes, residual = jax.jacfwd(both, (0, 1) if self.free_start else (0,), has_aux=True)(vector, offset)
+            slopes, residual = jax.jacfwd(both, (0, 1) if start.size else (0,), has_aux=True)(vector, start)
             return residual, *slopes
 
-        return jax.vmap(one)(windows, offsets)
+        return jax.vmap(one)(windows, starts, sizes)
 
-    def _over_windows(self, loss: Callable, windows: Windows, vectors: Array) -> Float[Array, " points"]:
-        """Return for each vector the loss of the residuals of all windows."""
+    def _change(self, free: Array) -> Array | None:
+        """Return the change of a start with these free numbers; None if all starts are known."""
+        return jnp.zeros(self.spread.shape[1], free.dtype).at[self._free].set(free) if free.size else None
 
-        def of_one(vector: Array) -> Array:
-            return loss(jax.vmap(lambda window: self._residuals(vector, None, window))(windows))
+    def _over_points(self, windows: Windows, points: Array, starts: Array) -> Array:
+        def of_one(given: tuple[Array, Array]) -> Array:
+            vector = self.coordinates.values(given[0])
+            return jax.vmap(lambda window, start: self._residuals(vector, start, window))(windows, given[1])
 
-        return jax.lax.map(of_one, vectors, batch_size=min(_SIDE_BY_SIDE, len(vectors)))
+        return jax.lax.map(of_one, (points, starts), batch_size=_SIDE_BY_SIDE)
+
+    def motions(self, windows: Windows, points: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Return the residuals of motions by point, window and number, with changes of the starts."""
+        size, dtype, found = min(_MOST_AT_ONCE, len(points)), self.coordinates.nominal.dtype, []
+        for begin in range(0, len(points), size):
+            parts = [x[begin : begin + size] for x in (points, starts)]
+            full = [jnp.asarray(np.pad(x, [(0, size - len(x)), *[(0, 0)] * (x.ndim - 1)]), dtype) for x in parts]
+            found.append(np.asarray(self._run(self._over_points, windows, *full), float)[: len(parts[0])])
+        return np.concatenate(found)
 
     def __call__(self, point: Array) -> tuple[Array, ...]:
         vector = self.coordinates.values(point[: len(self.coordinates.names)])
-        return self._run(self._traced, self.windows, vector, self.offsets(point))
+        return self._run(self._traced, self.windows, vector, self._starts(point), self._sizes)
 
     def start(self) -> Array:
-        """Return the point of the nominal values, without offsets: zero."""
-        num_offsets = len(self.windows.controls) * 2 * self.nominal.model.nv if self.free_start else 0
-        return jnp.zeros(len(self.coordinates.names) + num_offsets, self.coordinates.nominal.dtype)
+        """Return the point of the nominal values, with starts as they were given: zero."""
+        return jnp.zeros(len(self.coordinates.names) + self._sizes.size, self.coordinates.nominal.dtype)
 
     def box(self) -> tuple[Array, Array]:
-        """Return the bounds of a point; offsets are unbounded."""
-        free = jnp.full(len(self.start()) - len(self.coordinates.names), jnp.inf)
+        """Return the bounds of a point; starts are unbounded."""
+        free = jnp.full(self._sizes.size, jnp.inf)
         lower, upper = self.coordinates.box()
         return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
 
-    def searched(self, loss: Callable[[Array], Array]) -> Array:
-        """Return the best of many points between the bounds, by differential evolution of a loss of the residuals.
+    def _starts(self, point: Array) -> Array:
+        return point[len(self.coordinates.names) :].reshape(self._sizes.shape)
 
-        Hard contacts chatter: each switch of a contact makes the later motion jump, and the sum of squares has a minimum in
-        every cell between two jumps. After some of them two motions have nothing in common, and their squares drown what
-        still tells. A robust loss counts the numbers that fit, such as all before the first jump.
-        """
-        dtype, losses = self.coordinates.nominal.dtype, functools.partial(self._over_windows, loss)
-        low, high = (np.where(np.isfinite(x), x, sign) for x, sign in zip(self.coordinates.box(), (-1, 1), strict=True))
-
-        def losses_at(points: Float[np.ndarray, "dim points"]) -> Float[np.ndarray, " points"]:
-            vectors = self.coordinates.values(jnp.asarray(points.T, dtype))
-            found = np.asarray(self._run(losses, self.windows, vectors), float)
-            return np.where(np.isfinite(found), found, _DIVERGED)
-
-        points = np.random.default_rng(0).uniform(low, high, (_NUM_POINTS, len(low)))
-        points[0] = 0.0  # the nominal values, at which no motion diverges
-        settings: dict[str, Any] = {"maxiter": _NUM_GENERATIONS, "init": points, "rng": 0}
-        settings |= {
-            "polish": False,
-            "vectorized": True,
-            "updating": "deferred",
-            "mutation": (0.3, 0.9),
-            "recombination": 0.9,
-        }
-        best = scipy.optimize.differential_evolution(losses_at, list(zip(low, high, strict=True)), **settings)
-        return self.start().at[: len(low)].set(best.x)  # with starts as they were measured
-
-    def offsets(self, point: Array) -> Array | None:
-        """Return the offsets of the starts in a point, one row per window; None if starts are known."""
-        if not self.free_start:
+    def offsets(self, point: Array) -> np.ndarray | None:
+        """Return the changes of the starts at a point, one row per window; None if all starts are known."""
+        if not self._sizes.size:
             return None
-        return point[len(self.coordinates.names) :].reshape(len(self.windows.controls), -1)
+        return np.asarray(jax.vmap(self._change)(self._starts(point) * self._sizes))
 
-    def held_out_rms(self, held_out: Sequence[Recording], *points: np.ndarray) -> tuple[float, float] | None:
-        """Return the rms residuals of held-out recordings at each of two points; None without any."""
+    def held_out_rms(
+        self, held_out: Sequence[Recording], point: Array, many: Ensemble | None
+    ) -> tuple[float, float] | None:
+        """Return the rms residuals of held-out recordings at the nominal values and in the end; None without any."""
         if not held_out:
             return None
-        judged, vectors = stack(self.nominal, held_out), jnp.asarray(np.stack(points), self.coordinates.nominal.dtype)
-        squared = functools.partial(self._over_windows, lambda residual: jnp.sum(residual**2))
-        sums = compile_once(jax.jit(squared).lower(judged, vectors))(judged, vectors)
-        first, last = np.sqrt(np.asarray(sums, float) / _num_numbers(judged))
-        return float(first), float(last)
-
-
-def _robust(residual: Array, *, scale: float) -> Float[Array, ""]:
-    """Return the Cauchy loss of residuals, which grows with their logarithm beyond the scale."""
-    return jnp.sum(jnp.log1p((residual / scale) ** 2))
+        judged, noise = stack(self.nominal, held_out), spread(self.nominal, held_out, self.free_start)
+        ends = self.motions(judged, np.stack([np.zeros(len(point)), point]), np.zeros((2, *noise.shape)))
+        if many is not None:
+            draws = many.noise * np.random.default_rng(1).normal(size=(len(many.points), *noise.shape))
+            ends = [ends[0], many.judged(self.motions(judged, many.points, draws * noise))]
+        first, last = (float(np.linalg.norm(one) / np.sqrt(_num_numbers(judged))) for one in ends)
+        return first, last
 
 
 def _rms(program: _Program, found: tuple[Array, ...]) -> float:
@@ -413,7 +431,7 @@ def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, siz
     gradient = residual @ slope
     is_held = ((point[:count] <= lower) & (gradient > 0)) | ((point[:count] >= upper) & (gradient < 0))
     slope = slope * jnp.where(is_held, 0.0, program.coordinates.scale)
-    if program.free_start:
+    if len(found) > 2:
         slope = jnp.concatenate([slope, jax.scipy.linalg.block_diag(*found[2]) / size], axis=1)
     return point, residual, slope
 

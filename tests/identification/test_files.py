@@ -12,7 +12,7 @@ import mjxgrad as mg
 from mjxgrad import cli
 from mjxgrad.identification import files
 from mjxgrad.identification.parameters import write_all
-from mjxgrad.identification.recording import Recording, residuals, stack
+from mjxgrad.identification.recording import Recording, residuals, stack, start_of
 
 _SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
   <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/></body>
@@ -58,8 +58,9 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
         np.testing.assert_allclose(found.controls, [[1, 4], [2, 5], [3, 6]])
         np.testing.assert_allclose(found.measured["qpos"][:, [2, 7]], [[2.5, 0.5], [2.4, 0.6], [2.3, np.nan]])
         np.testing.assert_allclose(found.measured["tip"][:, 0], [2.5, 2.6, 2.7])
-        np.testing.assert_allclose(found.start.qpos, [0, 0, 2.5, 1, 0, 0, 0, 0.5])
-        np.testing.assert_allclose(found.start.qvel, [0, 0, 0, 0, 0, 0, 0.7])
+        start = start_of(scene, found, found.times)
+        np.testing.assert_allclose(start.qpos, [0, 0, 2.5, 1, 0, 0, 0, 0.5])
+        np.testing.assert_allclose(start.qvel, [0, 0, 0, 0, 0, 0, 0.7])
         np.testing.assert_allclose(found.noise["tip"][0], np.std([2.5, 2.6, 2.7]))
 
 
@@ -167,7 +168,8 @@ def test_held_out_is_the_end_of_one_motion_or_some_of_several():
     one = files.Recording({"place": np.arange(10.0)}, np.zeros((10, 2)), 0.01 * np.arange(10), 0.01 * np.arange(10))
     (early,), (late,) = files.hold_out([one], 0.3)
     assert len(early.times) == 7
-    np.testing.assert_array_equal(np.isfinite(late.measured["place"][:, 0]), np.arange(10) > 6)
+    is_judged = [True, *[False] * 6, *[True] * 3]  # the first row is the start
+    np.testing.assert_array_equal(np.isfinite(late.measured["place"][:, 0]), is_judged)
     fitted, judged = files.hold_out([one] * 10, 0.2)
     assert (len(fitted), len(judged)) == (8, 2)
 
