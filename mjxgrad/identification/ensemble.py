@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 # Motions of an ensemble at first and at most, at least for each parameter, and numbers at most, for memory.
 _NUM_MOTIONS, _PER_NUMBER, _MOST_NUMBERS = (512, 2048), 20, 1e8
-_MOST_ENSEMBLES = 20
+_MOST_ENSEMBLES, _PATIENCE = 20, 8  # ensembles at most, and since the misfit last fell
 MISFIT = (
     1.5  # root mean square of residuals over their covariance, at which chatter that is not normal is still explained
 )
@@ -106,7 +106,7 @@ def fit(
             break
         points = about(middle, covariance)
     prior = np.diag(12.0 / (high - low) ** 2)  # the variance of a point between the bounds
-    is_last = False
+    is_last, misfits = False, []
     for _ in range(_MOST_ENSEMBLES):
         points, residuals = run(about(middle, covariance))
         model = _Regression(points, residuals)
@@ -116,7 +116,8 @@ def fit(
         length = np.sqrt(step @ np.linalg.pinv(covariance, hermitian=True) @ step)
         step *= _LONGEST / max(length, _LONGEST)
         middle, fits = np.clip(model.middle + step, low, high), misfit < _FITS[most == largest] * count
-        if is_last and fits:
+        misfits.append(misfit)
+        if (is_last and fits) or min(misfits) < min(misfits[-_PATIENCE:]):
             break
         before, covariance = covariance, _WIDER**2 * max(misfit / count, 1.0) * inverse + np.outer(step, step)
         if not fits:  # the covariance of few motions lacks directions
@@ -140,10 +141,12 @@ class _Regression:
         # The covariance of each window in terms of its eigenvectors, fewer than motions.
         self._axes, self._variances = [], []
         for one in left.swapaxes(0, 1):
-            sizes, weights = np.linalg.eigh(one @ one.T)
+            is_wide = one.shape[0] < one.shape[1]
+            sizes, axes = np.linalg.eigh(one @ one.T if is_wide else one.T @ one)
             is_clear = sizes > _CLEAR * max(sizes.max(), np.finfo(float).tiny)
-            self._axes.append(one.T @ (weights[:, is_clear] / np.sqrt(sizes[is_clear])))
-            self._variances.append(sizes[is_clear] / (len(points) - away.shape[1]))
+            sizes, axes = sizes[is_clear], axes[:, is_clear]
+            self._axes.append(one.T @ (axes / np.sqrt(sizes)) if is_wide else axes)
+            self._variances.append(sizes / (len(points) - away.shape[1]))
         self._along = [axes.T @ columns for axes, columns in zip(self._axes, self._columns, strict=True)]
         across = self._columns - np.stack([a @ b for a, b in zip(self._axes, self._along, strict=True)])
         self._across = np.einsum("wni,wnj->ij", across, across)

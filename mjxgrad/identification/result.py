@@ -66,7 +66,6 @@ class Identification(Printed):
         held_out_rms: the same for the held-out recordings; None without any.
         offsets: changes of the starts; None where they are known, or where many motions were fitted.
         correlation: correlation of successive residuals of a signal, about 0 if only independent noise is left.
-        removable: share of the sum of squares that the linear model at the end could still remove; 0 at a smooth minimum.
         num_motions: 1, or the number of motions whose mean was fitted since contacts chatter; residuals are then those of the
             mean, over the covariance of noise and chatter.
         num_numbers: number of measured numbers.
@@ -91,7 +90,6 @@ class Identification(Printed):
     held_out_rms: tuple[float, float] | None
     offsets: Float[np.ndarray, "windows _"] | None
     correlation: float
-    removable: float
     num_motions: int
     num_numbers: int
     num_steps: int
@@ -167,8 +165,7 @@ class Identification(Printed):
         found = []
         if self.stopped is Stopped.STALLED:
             found.append(
-                f"Stalled: the linear model would remove {100 * self.removable:.2g} % of the sum of squares, but no step helps. "
-                "Jumps in the motion cause this: take contact=mg.Onset(), shorter windows or another start; doubt the intervals."
+                "Stalled: the mean of many motions does not settle. Give shorter windows (recording.cut) or softer contact."
             )
         if self.has_noise and self._is_unexplained:
             free = "" if self.offsets is not None or self.num_motions > 1 else "free_start=True, "

@@ -1,24 +1,23 @@
-r"""The search: residuals of all recordings in one program, their derivative in forward mode, and Levenberg-Marquardt.
+r"""The search: residuals of all recordings in one program, their derivative in forward mode, and a trust region.
 
 One program rolls out all windows of a scene under `jax.vmap`, with one tangent per parameter. The unknown start of a window
 affects that window alone, so the tangents of the starts do not grow with the number of windows. Each step of the search asks
-this program for residuals and derivative at one point, and optimistix chooses the next by their linear model. Where no single
+this program for residuals and derivative at one point, and SciPy chooses the next by their linear model. Where no single
 motion fits, or the sum of squares is rugged, the values are those of an ensemble.
 """
 
 import contextlib
-import functools
-import importlib
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+import scipy.linalg
+import scipy.optimize
+from jaxtyping import Array
 
 from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
@@ -31,20 +30,12 @@ from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
 Log = Callable[[int, dict[str, float]], None]
-_MOST_REFUSALS = 12  # in a row, which shorten a step by a factor of ten million
-_STALLED = 1e-2  # share of the sum of squares that the linear model would remove at the end
-_VANISHED = 1e3  # rounding errors of the first residuals: fewer are no misfit
-# Norm of the first residuals after scaling: optimistix's first damping, 1, is then about a tenth of JᵀJ.
-_FIRST_SIZE = 3.0  # with less, the first step may go too far to recover
-_GOOD = 0.75  # share of the predicted fall that lowers the damping; optimistix's 0.99 keeps it too long
-# Least gain as a share of the noise variance, and steps in a row below it: badly determined parameters make it creep.
-_TOO_LITTLE, _SLOW_STEPS = 1e-3, 3
+_TOO_LITTLE = 1e-3  # gain of a step at the end, of the noise variance
 _LEFT = 0.3  # of the first residuals
 _NUM_AWAY, _CLEAR = 5, 1e-10  # points a standard error away; share of the largest curvature that counts
 _RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretell
 _BETTER, _ALONE = 1.1, 0.5  # the residuals, the sum of squares of one motion, over the ensemble's at most
 _MOST_AT_ONCE, _SIDE_BY_SIDE = 256, 64  # motions in one call, and in one batch, for memory
-_NEAR_ENOUGH = 1e-3  # of a standard error: shorter steps end the search
 
 
 def identify(
@@ -61,10 +52,10 @@ def identify(
 ) -> Identification:
     r"""Identify parameters of a scene from recorded motions, through contact.
 
-    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by Levenberg-Marquardt with
+    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by a trust region with
     derivatives through the simulation. Where contacts chatter, no motion fits: then the mean of many motions is fitted,
     between the bounds, with starts as noisy as they were measured, and the intervals include the chatter. Ctrl-C ends the
-    search with the best values so far. Needs optimistix (`pip install 'mjxgrad[identify]'`).
+    search with the best values so far.
 
     Args:
         scene: the scene with nominal values.
@@ -86,7 +77,6 @@ def identify(
     Raises:
         ValueError: if there are no parameters or recordings, nothing was measured, or shapes do not fit the scene.
         DivergedError: if the simulation diverges with the nominal values.
-        ImportError: if optimistix is not installed.
     """
     if isinstance(recordings, Recording) or not recordings:
         raise ValueError(
@@ -104,16 +94,11 @@ def identify(
     max_steps = whole("max_steps", max_steps)
     function("log", log, "step", "metrics")
     instance("free_start", free_start, bool | None, "True, False or None")
-    try:  # before anything is compiled
-        importlib.import_module("optimistix")
-    except ImportError as error:
-        raise ImportError("identify needs optimistix, not installed: pip install 'mjxgrad[identify]'") from error
     if contact is None:
         has_sensors = any(set(one.measured) - set(STATES) for one in (*recordings, *held_out))
         contact = Discrete(None if has_sensors or scene.data.qpos.dtype == np.float64 else "mujoco")
     program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
-    start = program.start()
-    end = _descend(program, start, max_steps, log)
+    end = _descend(program, max_steps, log)
     has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
     if end.stopped is Stopped.INTERRUPTED:
         return _identified(program, end, None, held_out, has_noise)
@@ -144,12 +129,11 @@ def _ensemble(program: "_Program", noise: float | None, num_steps: int, log: Log
 
 
 def _is_off(program: "_Program", end: "_End", has_noise: bool) -> bool:
-    """Return whether a descent left more than noise; if that is not known, whether it stalled or explained little."""
+    """Return whether a descent left more than noise; if that is not known, whether it explained little."""
     after = _rms(program, end.found)
     if has_noise:
         return exceeds_noise(after, program.num_numbers - len(program.start()))
-    rounding = _VANISHED * float(jnp.finfo(end.point.dtype).eps)
-    return after > _LEFT * end.first or (end.removable > _STALLED and after > max(rounding, 1e-6) * end.first)
+    return after > _LEFT * end.first
 
 
 class _End(NamedTuple):
@@ -160,7 +144,6 @@ class _End(NamedTuple):
     num_steps: int
     stopped: Stopped
     first: float  # root mean square of the residuals at the start
-    removable: float  # share of the sum of squares that the linear model would still remove
 
 
 def _identified(
@@ -168,15 +151,13 @@ def _identified(
 ) -> Identification:
     """Return the values at the end of a search, or of an ensemble, with all that the recordings tell of them."""
     coordinates, numbers = program.coordinates, program.num_numbers
-    count, stopped, removable = len(coordinates.names), end.stopped, end.removable
+    count, stopped = len(coordinates.names), end.stopped
     if many is None:
         point, (residual, slope, num_offsets) = end.point[:count], _without_offsets(*on_host(end.found))
         signals = np.asarray(end.found[0], float)
-        if removable > _STALLED and _is_off(program, end, has_noise) and stopped is Stopped.CONVERGED:
-            stopped = Stopped.STALLED
     else:
         point, signals, residual, num_offsets = jnp.asarray(many.point), many.residual, many.residual, 0
-        slope, removable = many.slope / np.asarray(coordinates.scale, float), 0.0
+        slope = many.slope / np.asarray(coordinates.scale, float)
         stopped = (
             stopped if stopped is Stopped.INTERRUPTED else Stopped.CONVERGED if many.is_settled else Stopped.STALLED
         )
@@ -199,7 +180,6 @@ def _identified(
         else program.held_out_rms(held_out, end.point[:count], many),
         offsets=program.offsets(end.point) if many is None else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
-        removable=removable,
         num_motions=1 if many is None else len(many.points),
         num_numbers=numbers,
         num_steps=end.num_steps,
@@ -212,7 +192,7 @@ def _identified(
 
 def _ruggedness(program: "_Program", end: _End) -> float:
     """Return how a standard error away the sum of squares grows, over what its derivatives foretell: 1 where it is smooth."""
-    _, residual, slope = (np.asarray(x, float) for x in _linear_model(program, end.found, end.point, 1.0))
+    residual, slope = _linear_model(program, end.found)
     sizes, axes = np.linalg.eigh(slope.T @ slope)
     is_clear, total = sizes > _CLEAR * sizes.max(), float(residual @ residual)
     lengths = np.where(is_clear, np.sqrt(total / program.num_numbers / np.where(is_clear, sizes, 1.0)), 0.0)
@@ -221,7 +201,7 @@ def _ruggedness(program: "_Program", end: _End) -> float:
         change = axes @ (lengths * draw)
         there = program(jnp.asarray(end.point + change, end.point.dtype))[0]
         foretold = np.sum((slope @ change) ** 2) + np.finfo(float).tiny
-        growth.append((float(jnp.sum(there**2)) - total) / foretold)
+        growth.append(abs(float(jnp.sum(there**2)) - total) / foretold)
     return float(np.median(growth))
 
 
@@ -344,96 +324,48 @@ def _num_numbers(windows: Windows) -> int:
     return sum(int((np.asarray(weight) > 0).sum()) for weight in windows.weight.values())
 
 
-def _descend(program: _Program, point: Array, max_steps: int, log: Log | None) -> _End:
-    """Minimise the residuals from a point by Levenberg-Marquardt, until an interruption at most."""
-    lower, upper = program.box()
-    found = best = program(point)
-    first = _rms(program, found)
+def _descend(program: _Program, max_steps: int, log: Log | None) -> _End:
+    """Minimise the residuals from the nominal values, until an interruption at most."""
+    point, tolerance = program.start(), float(np.sqrt(jnp.finfo(program.start().dtype).eps))
+    end = best = _End(point, program(point), 0, Stopped.INTERRUPTED, 0.0)
+    first = _rms(program, best.found)
     if not np.isfinite(first):
         raise DivergedError("nominal values must give motions that stay finite, got one that diverged: begin elsewhere")
-    size = (first or 1.0) * math.sqrt(program.num_numbers) / _FIRST_SIZE
-    linear = _linear_model(program, found, point, size)
-    solver, state = _levenberg_marquardt(*linear[2].shape, point.dtype)
-    state = eqx.tree_at(lambda s: s.y_eval, state, point)
-    refusals, slow, removable, total = 0, 0, 1.0, math.inf
-    end = _End(point, best, 0, Stopped.INTERRUPTED, first, removable)
-    with contextlib.suppress(KeyboardInterrupt):
-        for count in range(1, max_steps + 1):
-            point, state, _ = _step(solver, point, state, linear)
-            is_accepted = int(state.num_steps_since_acceptance) == 0
-            if is_accepted:
-                fell, total = total - float(linear[1] @ linear[1]), float(linear[1] @ linear[1])
-                slow = slow + 1 if fell * program.num_numbers < _TOO_LITTLE * total else 0
-                best, refusals, removable = found, 0, float(_removable(linear))
-            else:
-                refusals += 1
-            end = _End(point, best, count, Stopped.INTERRUPTED, first, removable)
+    size, triangles = (first or 1.0) * math.sqrt(program.num_numbers), {}
+
+    def triangle(at: np.ndarray) -> np.ndarray:
+        """Return the triangular factor of derivative and residual, which has their products and few rows."""
+        nonlocal end, best
+        if (key := at.tobytes()) not in triangles:
+            triangles.clear()
+            point = jnp.asarray(at, best.point.dtype)
+            found = best.found if not best.num_steps else program(point)
+            end = _End(point, found, end.num_steps + 1, Stopped.INTERRUPTED, first)
+            rms = _rms(program, found)
+            is_better = not best.num_steps or rms < _rms(program, best.found)
+            best = end if is_better else best
             if log is not None:
-                rms = float(jnp.linalg.norm(linear[1])) / _FIRST_SIZE * first
-                log(count, {"rms": rms, "is_accepted": float(is_accepted)})
-            is_near = removable * program.num_numbers < _NEAR_ENOUGH**2
-            if is_near or bool(state.terminate) or refusals == _MOST_REFUSALS or slow == _SLOW_STEPS:
-                return end._replace(stopped=Stopped.CONVERGED)
-            state = eqx.tree_at(lambda s: s.y_eval, state, jnp.clip(state.y_eval, lower, upper))
-            found = program(state.y_eval)
-            linear = _linear_model(program, found, state.y_eval, size)
-        return end._replace(stopped=Stopped.STEPS)
-    return end
+                log(end.num_steps, {"rms": rms, "is_accepted": float(is_better)})
+            residual, slope = _linear_model(program, found)
+            is_finite = np.isfinite(residual).all() and np.isfinite(slope).all()
+            factor = np.linalg.qr(np.column_stack([slope, residual]) / size, mode="r") if is_finite else np.inf
+            triangles[key] = np.broadcast_to(factor, (min(len(residual), len(at) + 1), len(at) + 1))
+        return triangles[key]
+
+    with contextlib.suppress(KeyboardInterrupt):
+        settings = {"ftol": _TOO_LITTLE / program.num_numbers, "xtol": tolerance, "gtol": None}
+        bounds = tuple(np.asarray(part, float) for part in program.box())
+        of, by = (lambda at: triangle(at)[:, -1]), (lambda at: triangle(at)[:, :-1])
+        done = scipy.optimize.least_squares(of, np.asarray(point, float), by, bounds, max_nfev=max_steps, **settings)
+        best = best._replace(stopped=Stopped.CONVERGED if done.status else Stopped.STEPS)
+    return best._replace(num_steps=end.num_steps)
 
 
-@functools.lru_cache(maxsize=32)
-def _levenberg_marquardt(numbers: int, unknowns: int, dtype: Any) -> tuple[Any, Any]:
-    """Return optimistix's solver and its state at zero; it sees only linear models.
-
-    The state holds functions of this solver, so a step with the state of another solver would be compiled again.
-    """
-    optimistix, tolerance = importlib.import_module("optimistix"), float(np.sqrt(jnp.finfo(dtype).eps))
-    solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    solver = eqx.tree_at(lambda s: s.search, solver, optimistix.ClassicalTrustRegion(high_cutoff=_GOOD))
-    point, residual = jnp.zeros(unknowns, dtype), jnp.zeros(numbers, dtype)
-    linear = (point, residual, jnp.zeros((numbers, unknowns), dtype))
-    struct = jax.eval_shape(lambda: residual)
-    return solver, solver.init(_predict, point, linear, {}, (struct, None), None, frozenset())
-
-
-@eqx.filter_jit
-def _step(solver: Any, point: Array, state: Any, linear: tuple[Array, Array, Array]) -> tuple[Array, Any, Any]:
-    """Return the next point, its state, and further results of optimistix."""
-    return solver.step(_predict, point, linear, {}, state, frozenset())
-
-
-def _predict(point: Array, linear: tuple[Array, Array, Array]) -> tuple[Array, None]:
-    """Return the residuals of the linear model; exact at the point where it was made."""
-    at, residual, slope = linear
-    return residual + slope @ (point - at), None
-
-
-@jax.jit
-def _removable(linear: tuple[Array, Array, Array]) -> Float[Array, ""]:
-    """Return the share of the sum of squares that the linear model would remove along clear directions."""
-    _, residual, slope = linear
-    lengths = jnp.linalg.norm(slope, axis=0)
-    columns = slope / jnp.where(lengths > 0, lengths, 1.0)
-    sizes, axes = jnp.linalg.eigh(columns.T @ columns)
-    along = axes.T @ (columns.T @ residual)
-    is_clear = sizes > jnp.sqrt(jnp.finfo(sizes.dtype).eps) * jnp.max(sizes)
-    total = jnp.sum(residual**2)
-    removed = jnp.sum(jnp.where(is_clear, along**2 / jnp.where(is_clear, sizes, 1.0), 0.0))
-    return removed / jnp.where(total > 0, total, 1.0)
-
-
-def _linear_model(program: _Program, found: tuple[Array, ...], point: Array, size: float) -> tuple[Array, Array, Array]:
-    """Return a point, its residuals in units of the first ones, and their derivative by the point."""
-    count = len(program.coordinates.names)
-    residual, slope = found[0].ravel() / size, found[1].reshape(-1, count) / size
-    # A number that the residuals push against its bound stays there; the others move without it.
-    lower, upper = (part[:count] for part in program.box())
-    gradient = residual @ slope
-    is_held = ((point[:count] <= lower) & (gradient > 0)) | ((point[:count] >= upper) & (gradient < 0))
-    slope = slope * jnp.where(is_held, 0.0, program.coordinates.scale)
-    if len(found) > 2:
-        slope = jnp.concatenate([slope, jax.scipy.linalg.block_diag(*found[2]) / size], axis=1)
-    return point, residual, slope
+def _linear_model(program: _Program, found: tuple[Array, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals and their derivative by the point."""
+    residual, slope, *by_start = (np.asarray(part, float) for part in found)
+    slope = slope.reshape(residual.size, -1) * np.asarray(program.coordinates.scale, float)
+    return residual.ravel(), np.column_stack([slope, *(scipy.linalg.block_diag(*part) for part in by_start)])
 
 
 def _without_offsets(

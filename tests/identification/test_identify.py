@@ -1,7 +1,5 @@
 """Parameters come back from motions that were made with them, as surely as the noise allows."""
 
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -212,12 +210,6 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     assert np.abs(found).max() < 1e-7
     whole_found = np.array(evaluate(stack(scene, [whole]))[0]).reshape(31, 14)[:, :7]
     np.testing.assert_allclose(whole_found[25], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
-
-
-def test_without_optimistix_the_extra_is_named(cart, monkeypatch):
-    monkeypatch.setitem(sys.modules, "optimistix", None)
-    with pytest.raises(ImportError, match=r"pip install 'mjxgrad\[identify\]'"):
-        mg.identify(cart, {"a": Parameter(1.0)}, [Recording({"place": np.zeros(5)})])
 
 
 def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):

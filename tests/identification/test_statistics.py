@@ -2,13 +2,12 @@
 
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mjxgrad.identification.parameters import Coordinates, Parameter
 from mjxgrad.identification.result import statistics
-from mjxgrad.identification.search import _removable, _without_offsets
+from mjxgrad.identification.search import _without_offsets
 
 
 def _coordinates(**nominal):
@@ -59,17 +58,6 @@ def test_combinations_that_cannot_be_told_apart_are_named_with_their_shares():
     assert named["a", "b"]["b"] / named["a", "b"]["a"] == pytest.approx(0.5)
     assert named["c", "d"]["d"] / named["c", "d"]["c"] == pytest.approx(-1.0)
     np.testing.assert_array_equal(np.isfinite(found.half_width), [False, False, False, False, True])
-
-
-def test_what_the_derivative_could_still_remove_is_one_at_a_slope_and_zero_at_a_minimum():
-    rng = np.random.default_rng(4)
-    design = rng.normal(size=(15, 2))
-    outside = rng.normal(size=15)
-    outside -= design @ np.linalg.lstsq(design, outside, rcond=None)[0]
-    for residual, expected in ((outside, 0.0), (design @ np.array([1.0, 3.0]), 1.0)):
-        assert float(_removable((jnp.zeros(2), jnp.asarray(residual), jnp.asarray(design)))) == pytest.approx(
-            expected, abs=1e-12
-        )
 
 
 def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():
