@@ -230,7 +230,7 @@ def identify(
         noise: name=standard deviation, of every measured column, or of qpos, qvel and sensors as a whole. Then the answer says
             whether more than noise is left; by default each signal is weighed by how much it varies.
         held_out: share for validation only: every n-th recording, or the end of a single one.
-        free_start: find the start of each motion, too; otherwise the noise of the first state affects the values.
+        free_start: find what the first row lacks of the start, too, such as speeds; otherwise it is the scene's pose, at rest.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
@@ -262,7 +262,7 @@ def identify(
         fitted,
         held_out=judged,
         delay="delay" if "delay" in wanted else None,
-        free_start=free_start,
+        free_start=free_start or None,
         log=lambda step, metrics: log(f"step {step}: error {metrics['rms']:.3g} {unit}"),
     )
     print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)
