@@ -50,8 +50,8 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
     signals.sort(key=lambda one: -one[0])
     panel = functools.partial(_panel, float(scene.model.opt.timestep), fitted_until)
     drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals[:_MOST_SIGNALS]]
-    line = "with the values found" if result.num_motions == 1 else "one of the motions with the values found, for contacts chatter"
-    caption = f"SI units. Dots: measured. Dashed: where the search began. Line: {line}. Grey: held out."
+    chatters = " as one of many motions, since contacts chatter" * (result.num_motions > 1)
+    caption = f"SI units. Dots: measured. Dashed: where the search began. Line: with the values found{chatters}. Grey: held out."
     if len(signals) > len(drawings):
         caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
     return Block(drawings=drawings, caption=caption)
