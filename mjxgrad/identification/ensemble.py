@@ -22,13 +22,10 @@ from jaxtyping import Float
 # Motions of an ensemble at first and at most, at least for each parameter, and numbers at most, for memory.
 _NUM_MOTIONS, _PER_NUMBER, _MOST_NUMBERS = (512, 2048), 20, 1e8
 _MOST_ENSEMBLES, _PATIENCE = 20, 8  # ensembles at most, and since the misfit last fell
-MISFIT = (
-    1.5  # root mean square of residuals over their covariance, at which chatter that is not normal is still explained
-)
-_ELITE, _STILL_FALLS = (
-    0.0625,
-    0.98,
-)  # share of the motions that fit best; factor of their median loss by which it goes on
+# Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
+MISFIT = 1.5
+# Share of the motions that fit best; factor of their median loss by which it goes on.
+_ELITE, _STILL_FALLS = 0.0625, 0.98
 # Scale of the first loss, which grows with logarithms beyond it: after some jumps two motions have nothing in common, and their
 # squares would drown what still tells. It is a share of the noise, or of the nominal motion's residuals.
 _SCALE, _SCALE_OF_FIRST = 0.3, 0.03
@@ -79,55 +76,82 @@ def fit(
         noise: size of the noise in units of the residuals, None for unknown.
         log: called with the root mean square misfit of each ensemble.
     """
-    rng, (low, high), size = np.random.default_rng(0), box, noise or 0.0
-    fewest = _PER_NUMBER * len(low)
-    most, largest = (max(fewest, min(number, int(_MOST_NUMBERS / count))) for number in _NUM_MOTIONS)
+    draw = _Draw(motions, box, starts, count, noise or 0.0)
+    first, middle, covariance = _narrowed(draw, count, noise, log)
+    prior = np.diag(12.0 / (box[1] - box[0]) ** 2)  # the variance of a point between the bounds
+    is_last, misfits = False, []
+    while True:
+        points, residuals = draw(middle, covariance)
+        model = _Regression(points, residuals)
+        sizes = [noise] if noise else first * _SIZES
+        draw.noise = size = min(sizes, key=lambda one: model.deviance(one, count, prior))
+        step, inverse, misfit = model.solved(size, prior)
+        log(size * np.sqrt(misfit / count))
+        misfits.append(misfit)
+        length = np.sqrt(step @ np.linalg.pinv(covariance, hermitian=True) @ step)
+        step *= _LONGEST / max(length, _LONGEST)
+        middle, fits = np.clip(model.middle + step, *box), misfit < _FITS[draw.is_full] * count
+        if (is_last and fits) or min(misfits) < min(misfits[-_PATIENCE:]) or len(misfits) == _MOST_ENSEMBLES:
+            break
+        before, covariance = covariance, _WIDER**2 * max(misfit / count, 1.0) * inverse + np.outer(step, step)
+        if not fits:
+            draw.grow()
+        is_last = length < _SHORT and fits and (np.diag(before) < _SETTLED**2 * np.diag(covariance)).all()
+        covariance *= _LAST**2 if is_last else 1.0
+    both, least = model.over_root(size) * size, float((residuals**2).sum(axis=(1, 2)).min())
+    residual = both @ np.append(1.0, middle - model.middle)
+    return Ensemble(middle, points, least, size, bool(is_last and fits), residual, both[:, 1:])
 
-    def run(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        residuals = motions(points, size * rng.normal(size=(len(points), *starts)))
+
+class _Draw:
+    """Motions of points about a middle, or between the bounds, with starts off by their noise."""
+
+    def __init__(
+        self, motions: Motions, box: tuple[np.ndarray, np.ndarray], starts: tuple[int, int], count: int, noise: float
+    ):
+        self._motions, self._box, self._starts, self.noise = motions, box, starts, noise
+        fewest = _PER_NUMBER * len(box[0])
+        self._size, self._most = (max(fewest, min(number, int(_MOST_NUMBERS / count))) for number in _NUM_MOTIONS)
+        self._rng = np.random.default_rng(0)
+
+    @property
+    def is_full(self) -> bool:
+        return self._size == self._most
+
+    def grow(self) -> None:
+        """Draw more motions from now on, for the covariance of few lacks directions."""
+        self._size = min(2 * self._size, self._most)
+
+    def __call__(
+        self, middle: np.ndarray | None = None, covariance: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return points and residuals of the motions that stay finite."""
+        if middle is None or covariance is None:
+            points = self._rng.uniform(*self._box, (self._size, len(self._box[0])))
+            points[0] = 0.0  # the nominal values, at which no motion diverges
+        else:
+            points = np.clip(self._rng.multivariate_normal(middle, covariance, self._size, method="eigh"), *self._box)
+        residuals = self._motions(points, self.noise * self._rng.normal(size=(len(points), *self._starts)))
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
         return points[is_finite], residuals[is_finite]
 
-    def about(middle: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        return np.clip(rng.multivariate_normal(middle, covariance, most, method="eigh"), low, high)
 
-    points, lowest, first = rng.uniform(low, high, (most, len(low))), np.inf, 0.0
-    points[0] = 0.0  # the nominal values, at which no motion diverges
-    for _ in range(_MOST_ENSEMBLES):
-        points, residuals = run(points)
-        first = first or float(np.sqrt((residuals[0] ** 2).sum() / count))
-        scale = _SCALE * noise if noise else _SCALE_OF_FIRST * first
+def _narrowed(
+    draw: _Draw, count: int, noise: float | None, log: Callable[[float], None]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return the nominal root mean square, and mean and covariance of points that fit best, by the cross-entropy method."""
+    points, residuals = draw()
+    first, medians = float(np.sqrt((residuals[0] ** 2).sum() / count)), [np.inf]
+    scale = _SCALE * noise if noise else _SCALE_OF_FIRST * first
+    while True:
         losses = np.log1p((residuals / scale) ** 2).sum(axis=(1, 2))
-        best = np.argsort(losses)[: max(int(_ELITE * most), 2 * len(low))]
+        best = np.argsort(losses)[: max(int(_ELITE * len(points)), 2 * points.shape[1])]
         middle, covariance = points[best].mean(axis=0), 2.0 * np.atleast_2d(np.cov(points[best].T))
-        previous, lowest = lowest, float(np.median(losses[best]))
-        log(np.sqrt((residuals[best] ** 2).sum(axis=(1, 2)).min() / count))
-        if lowest > _STILL_FALLS * previous:
-            break
-        points = about(middle, covariance)
-    prior = np.diag(12.0 / (high - low) ** 2)  # the variance of a point between the bounds
-    is_last, misfits = False, []
-    for _ in range(_MOST_ENSEMBLES):
-        points, residuals = run(about(middle, covariance))
-        model = _Regression(points, residuals)
-        size = min([noise] if noise else first * _SIZES, key=lambda one: model.deviance(one, count, prior))
-        step, inverse, misfit = model.solved(size, prior)
-        log(size * np.sqrt(misfit / count))
-        length = np.sqrt(step @ np.linalg.pinv(covariance, hermitian=True) @ step)
-        step *= _LONGEST / max(length, _LONGEST)
-        middle, fits = np.clip(model.middle + step, low, high), misfit < _FITS[most == largest] * count
-        misfits.append(misfit)
-        if (is_last and fits) or min(misfits) < min(misfits[-_PATIENCE:]):
-            break
-        before, covariance = covariance, _WIDER**2 * max(misfit / count, 1.0) * inverse + np.outer(step, step)
-        if not fits:  # the covariance of few motions lacks directions
-            most = min(2 * most, largest)
-        is_last = length < _SHORT and fits and (np.diag(before) < _SETTLED**2 * np.diag(covariance)).all()
-        covariance *= _LAST**2 if is_last else 1.0
-    both = model.over_root(size) * size
-    residual = both @ np.append(1.0, middle - model.middle)
-    least = float((residuals**2).sum(axis=(1, 2)).min())
-    return Ensemble(middle, points, least, size, bool(is_last and fits), residual, both[:, 1:])
+        medians.append(float(np.median(losses[best])))
+        log(float(np.sqrt((residuals[best] ** 2).sum(axis=(1, 2)).min() / count)))
+        if medians[-1] > _STILL_FALLS * medians[-2] or len(medians) > _MOST_ENSEMBLES:
+            return first, middle, covariance
+        points, residuals = draw(middle, covariance)
 
 
 class _Regression:

@@ -352,20 +352,21 @@ def _descend(program: _Program, max_steps: int, log: Log | None) -> _End:
             triangles[key] = np.broadcast_to(factor, (min(len(residual), len(at) + 1), len(at) + 1))
         return triangles[key]
 
+    of, by = (lambda at: triangle(at)[:, -1]), (lambda at: triangle(at)[:, :-1])
+    settings: dict[str, Any] = {"ftol": _TOO_LITTLE / program.num_numbers, "xtol": tolerance, "gtol": None, "jac": by}
+    bounds = tuple(np.asarray(part, float) for part in program.box())
     with contextlib.suppress(KeyboardInterrupt):
-        settings = {"ftol": _TOO_LITTLE / program.num_numbers, "xtol": tolerance, "gtol": None}
-        bounds = tuple(np.asarray(part, float) for part in program.box())
-        of, by = (lambda at: triangle(at)[:, -1]), (lambda at: triangle(at)[:, :-1])
-        done = scipy.optimize.least_squares(of, np.asarray(point, float), by, bounds, max_nfev=max_steps, **settings)
+        done = scipy.optimize.least_squares(of, np.asarray(point, float), bounds=bounds, max_nfev=max_steps, **settings)
         best = best._replace(stopped=Stopped.CONVERGED if done.status else Stopped.STEPS)
     return best._replace(num_steps=end.num_steps)
 
 
 def _linear_model(program: _Program, found: tuple[Array, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals and their derivative by the point."""
-    residual, slope, *by_start = (np.asarray(part, float) for part in found)
+    residual, slope, *by_start = on_host(found)
+    blocks: list[Any] = [scipy.linalg.block_diag(*part) for part in by_start]
     slope = slope.reshape(residual.size, -1) * np.asarray(program.coordinates.scale, float)
-    return residual.ravel(), np.column_stack([slope, *(scipy.linalg.block_diag(*part) for part in by_start)])
+    return residual.ravel(), np.column_stack([slope, *blocks])
 
 
 def _without_offsets(
