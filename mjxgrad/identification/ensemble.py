@@ -19,6 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mjxgrad.rollouts import DivergedError
+
 # Motions of an ensemble at first and at most, at least for each parameter, and numbers at most, for memory.
 _NUM_MOTIONS, _PER_NUMBER, _MOST_NUMBERS = (512, 2048), 20, 1e8
 _MOST_ENSEMBLES, _PATIENCE = 20, 8  # ensembles at most, and since the misfit last fell
@@ -133,6 +135,8 @@ class _Draw:
             points = np.clip(self._rng.multivariate_normal(middle, covariance, self._size, method="eigh"), *self._box)
         residuals = self._motions(points, self.noise * self._rng.normal(size=(len(points), *self._starts)))
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
+        if is_finite.sum() < 2 * points.shape[1] + 2:
+            raise DivergedError("most motions must stay finite between the bounds, got few: give narrower ones")
         return points[is_finite], residuals[is_finite]
 
 

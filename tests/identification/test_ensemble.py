@@ -1,6 +1,7 @@
 """The mean of many motions finds what least squares with the true covariance would, chatter and noisy starts included."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -59,6 +60,19 @@ def test_values_and_covariance_are_those_of_generalised_least_squares(knows_nois
     np.testing.assert_allclose(found.judged(last[0]), found.residual, rtol=1e-6, atol=1e-9)
     if not chatter:
         np.testing.assert_allclose(found.noise, noise, rtol=0.2)
+
+
+def test_motions_that_diverge_do_not_count_unless_most_do():
+    motions, *_ = _problem(1.0, 0.0, np.random.default_rng(0))
+
+    def diverging(share, points, starts):
+        return np.where(np.arange(len(points))[:, None, None] % 10 < share, np.inf, motions(points, starts))
+
+    box, shape = (-np.ones(2), np.ones(2)), (_WINDOWS, 3)
+    found = fit(functools.partial(diverging, 3), box, shape, _WINDOWS * _NUMBERS, 1.0, lambda rms: None)
+    np.testing.assert_allclose(found.point, _TRUE, atol=0.1)
+    with pytest.raises(mg.DivergedError, match="between the bounds, got few"):
+        fit(functools.partial(diverging, 10), box, shape, _WINDOWS * _NUMBERS, 1.0, lambda rms: None)
 
 
 def test_the_start_is_as_noisy_as_the_first_row_that_gives_it():
