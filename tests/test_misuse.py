@@ -78,7 +78,7 @@ def planned(**how):
 
 
 def sampled(**how):
-    given = {"stddev_state": 0.1, "stddev_control": 0.1, "num_samples": 10, "order": "zeroth"}
+    given = {"stddev_state": 0.1, "stddev_control": 0.1, "num_samples": 10}
     return planning.Sampled(**given | how).linear_model(system, jnp.zeros(2), jnp.zeros(2), key)
 
 

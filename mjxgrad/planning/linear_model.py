@@ -7,13 +7,11 @@ Around a state $x$ and a control $u$, with noise $w = (w_x, w_u) \sim N(0, \oper
 Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space.
 Across a contact the mean is smooth even where f is not: A and B contain the effect of a push already before the touch.
 
-There are three ways to this model:
+There are two ways to this model:
 
-- `Sampled` in first order averages Jacobians. It misses their blind spots: jumps of f, and with `mg.Discrete()` the
-  shift of the time of an impact.
-- `Sampled` in zeroth order fits a plane to samples of f. It misses nothing, at the price of noise.
+- `Sampled` fits a plane to samples of f. It misses nothing, at the price of noise.
 - `Analytic` differentiates a step whose solver averages the contact force. The noise is on the distance of contacts, not on
-  the state, and the acceleration is solved for after the average. It agrees with the others for impedances far below one.
+  the state, and the acceleration is solved for after the average. It agrees with the other for impedances far below one.
 
 References:
     Suh, Pang, Tedrake. Bundled Gradients through Contact via Randomized Smoothing. RA-L 2022, arXiv:2109.05143.
@@ -22,7 +20,6 @@ References:
 """
 
 from abc import abstractmethod
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -93,8 +90,7 @@ class Analytic(Smoother):
         if native is not None:
             end, change, jacobian = native.linearised(state, control)
         else:
-            noise = jnp.zeros((0, system.num_changes + system.num_controls), state.dtype)
-            end, (change,), (jacobian,) = _linearised(system, state, control, noise)
+            end, change, jacobian = _linearised(system, state, control)
         return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
 
     def native(self, system: System) -> SceneSystem | None:
@@ -139,18 +135,13 @@ class Sampled(Smoother):
     Attributes:
         stddev_state: standard deviation of the noise on the state, a number or one per coordinate of a change.
         stddev_control: standard deviation of the noise on the control, a number or one per control.
-        num_samples: number of samples. A smoothed step takes `1 + 2 num_samples` steps, a linear model `1 + num_samples`.
-        order: "first" averages Jacobians; "zeroth" fits a plane, to two samples more than coordinates at least.
+        num_samples: number of samples. A smoothed step takes `1 + 2 num_samples` steps, a linear model `1 + num_samples`. The
+            latter needs two samples more than there are coordinates.
     """
 
     stddev_state: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     stddev_control: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
     num_samples: int = eqx.field(static=True)
-    order: Literal["first", "zeroth"] = eqx.field(static=True, default="zeroth")
-
-    def __check_init__(self):
-        if self.order not in ("first", "zeroth"):
-            raise ValueError(f"order must be 'first' or 'zeroth', got {self.order!r}")
 
     def step(self, system, state, control, key):
         """Return the mean of the finite next states; samples have mirror images, so a linear step has no error."""
@@ -161,30 +152,6 @@ class Sampled(Smoother):
         return system.retract(nominal, _mean(value, is_finite))
 
     def linear_model(self, system, state, control, key):
-        model = self._zeroth_order if self.order == "zeroth" else self._first_order
-        return model(system, state, control, key)
-
-    def _first_order(
-        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
-    ) -> LinearModel:
-        """Return the linear model from averaged Jacobians; exact for a linear step.
-
-        From each sample's next state the part that the other samples' mean Jacobian explains is subtracted.
-        """
-        stddev, unit = self._drawn(system, state, key, least=2)
-        noise = stddev * unit
-        nominal, value, jacobian = _linearised(system, state, control, noise)
-        value, jacobian = value[1:], jacobian[1:]
-        is_finite = jnp.all(jnp.isfinite(jacobian), axis=(1, 2)) & jnp.all(jnp.isfinite(value), axis=1)
-        count = is_finite.sum()
-        mean = _mean(jacobian, is_finite)
-        others = (count * mean - jacobian) / jnp.maximum(count - 1, 1)
-        rest = _mean(value - jnp.einsum("inm,im->in", others, noise), is_finite)
-        return _model(system, nominal, mean, rest, count >= 2)
-
-    def _zeroth_order(
-        self, system: System, state: StateVector, control: ControlVector, key: PRNGKeyArray
-    ) -> LinearModel:
         """Return the linear model from a plane fitted to samples of the step by least squares.
 
         Its slope converges to the derivative of the mean (Stein's identity). A column without noise is zero.
@@ -236,24 +203,16 @@ def _sampled(
 
 
 def _linearised(
-    system: System, state: StateVector, control: ControlVector, noise: _Samples
-) -> tuple[StateVector, Float[Array, "M n"], Float[Array, "M n both"]]:
-    """Return the next state without noise; and changes from it with their derivatives, of it, then of each sample."""
+    system: System, state: StateVector, control: ControlVector
+) -> tuple[StateVector, ChangeVector, Float[Array, "n both"]]:
+    """Return the next state; and no change, NaN if there is no state, with its derivative by state and control."""
 
-    def sample(noise):
-        def moved(change):
-            end = _perturbed(system, state, control, noise + change)
-            return end, end
+    def moved(change):
+        end = _perturbed(system, state, control, change)
+        return end, end
 
-        return jax.jacfwd(moved, has_aux=True)(jnp.zeros_like(noise))
-
-    # The step without noise runs in the same batch: a separate call would be compiled a second time.
-    jacobians, ends = jax.vmap(sample)(jnp.pad(noise, ((1, 0), (0, 0))))
-
-    def change(end, jacobian):
-        return system.difference(end, ends[0]), jax.jacfwd(system.difference)(end, ends[0]) @ jacobian
-
-    return ends[0], *jax.vmap(change)(ends, jacobians)
+    jacobian, end = jax.jacfwd(moved, has_aux=True)(jnp.zeros(system.num_changes + system.num_controls, state.dtype))
+    return end, system.difference(end, end), jax.jacfwd(system.difference)(end, end) @ jacobian
 
 
 def _mean(samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]) -> Float[Array, "..."]:

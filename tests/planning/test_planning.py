@@ -132,9 +132,8 @@ def pushing(smoother):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("order", ["first", "zeroth"])
-def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models(order):
-    plan = pushing(Sampled(0.3, 0.05, 30, order))
+def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models():
+    plan = pushing(Sampled(0.3, 0.05, 30))
     # The finger's way is GAP + 1 in eight steps, at the least (1 + GAP)² / 8 squared controls, half of it at a weight of 0.01.
     assert plan.cost < 1.5 * 0.5 * 0.01 * (1 + GAP) ** 2 / 8
     assert plan.start_cost == 5.0
@@ -163,7 +162,7 @@ def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves():
 
 
 def test_a_plan_is_the_rollout_of_its_controls():
-    plan = pushing(Sampled(0.3, 0.05, 30, "first"))
+    plan = pushing(Sampled(0.3, 0.05, 30))
     state = plan.states[0]
     for control, expected in zip(plan.controls, plan.states[1:], strict=True):
         state = pushed(state, control)
@@ -180,7 +179,7 @@ def test_to_plan_again_compiles_nothing(compilations):
     for i in range(3):
         before = len(compilations)
         system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL + i, STAGE, TERMINAL, CONTROL + i)
-        smoother = Sampled(0.1 + i, 0.1, num_samples=4, order="first")
+        smoother = Sampled(0.1 + i, 0.1, num_samples=6)
         plan = optimise_trajectory(
             system,
             cost,
