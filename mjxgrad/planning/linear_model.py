@@ -2,7 +2,7 @@ r"""Smoothed linear models of a step: the mean next state, over a little noise, 
 
 Around a state $x$ and a control $u$, with noise $w = (w_x, w_u) \sim N(0, \operatorname{diag} s^2)$, the mean step is
 
-    E f(x + dx + w_x, u + du + w_u)  ≈  c + A dx + B du.
+    E f(x + dx + w_x, u + du + w_u)  ≈  E f(x + w_x, u + w_u) + A dx + B du.
 
 Sums of states are `System.retract`; the change on the left is taken from $f(x, u)$, in the coordinates of its tangent space.
 Across a contact the mean is smooth even where f is not: A and B contain the effect of a push already before the touch.
@@ -30,7 +30,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
-from mjxgrad.planning.system import ChangeVector, ControlVector, SceneSystem, StateVector, System
+from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System
 from mjxgrad.rollouts.arguments import native_motion
 from mjxgrad.stepping import Smoothing
 
@@ -43,12 +43,10 @@ class LinearModel(eqx.Module):
     Attributes:
         A: derivative of the next state's change by the present state's; NaN, like all, if too few samples are finite.
         B: derivative of the next state's change by the control.
-        c: mean next state.
     """
 
     A: Float[Array, "n n"]
     B: Float[Array, "n m"]
-    c: StateVector
 
 
 class Smoother(eqx.Module):
@@ -87,11 +85,8 @@ class Analytic(Smoother):
 
     def linear_model(self, system, state, control, key):
         native, system = self.native(system), self._smoothed(system)
-        if native is not None:
-            end, change, jacobian = native.linearised(state, control)
-        else:
-            end, change, jacobian = _linearised(system, state, control)
-        return _model(system, end, jacobian, change, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(change)))
+        end, jacobian = _linearised(system, state, control) if native is None else native.linearised(state, control)
+        return _model(system, jacobian, jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(end)))
 
     def native(self, system: System) -> SceneSystem | None:
         """Return the system to be stepped if C MuJoCo steps it, a whole trajectory in one call; otherwise None."""
@@ -158,7 +153,7 @@ class Sampled(Smoother):
         """
         least = system.num_changes + system.num_controls + 2
         stddev, unit = self._drawn(system, state, key, least)
-        nominal, value = _sampled(system, state, control, stddev * unit)
+        _, value = _sampled(system, state, control, stddev * unit)
         is_finite = jnp.all(jnp.isfinite(value), axis=1)
         value = jnp.where(is_finite[:, None], value, 0.0)
         # In units of the noise the normal equations are well conditioned for any units of the coordinates.
@@ -169,7 +164,7 @@ class Sampled(Smoother):
         slope = jnp.linalg.solve(gram, design.T @ value)
         is_seen = stddev[:, None] > 0
         jacobian = jnp.where(is_seen, slope[1:] / jnp.where(is_seen, stddev[:, None], 1.0), 0.0).T
-        return _model(system, nominal, jacobian, slope[0], enough)
+        return _model(system, jacobian, enough)
 
     def _drawn(
         self, system: System, state: StateVector, key: PRNGKeyArray, least: int
@@ -204,15 +199,15 @@ def _sampled(
 
 def _linearised(
     system: System, state: StateVector, control: ControlVector
-) -> tuple[StateVector, ChangeVector, Float[Array, "n both"]]:
-    """Return the next state; and no change, NaN if there is no state, with its derivative by state and control."""
+) -> tuple[StateVector, Float[Array, "n both"]]:
+    """Return the next state, and the derivative of its change by state and control."""
 
     def moved(change):
         end = _perturbed(system, state, control, change)
         return end, end
 
     jacobian, end = jax.jacfwd(moved, has_aux=True)(jnp.zeros(system.num_changes + system.num_controls, state.dtype))
-    return end, system.difference(end, end), jax.jacfwd(system.difference)(end, end) @ jacobian
+    return end, jax.jacfwd(system.difference)(end, end) @ jacobian
 
 
 def _mean(samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]) -> Float[Array, "..."]:
@@ -220,14 +215,6 @@ def _mean(samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]) -> Float[A
     return jnp.where(used, samples, 0.0).sum(axis=0) / jnp.maximum(is_used.sum(), 1)
 
 
-def _model(
-    system: System,
-    nominal: StateVector,
-    jacobian: Float[Array, "n both"],
-    change: ChangeVector,
-    exists: Bool[Array, ""],
-) -> LinearModel:
+def _model(system: System, jacobian: Float[Array, "n both"], exists: Bool[Array, ""]) -> LinearModel:
     """Return the linear model from a Jacobian by state and control; all NaN if it does not exist."""
-    jacobian, change = (jnp.where(exists, x, jnp.nan) for x in (jacobian, change))
-    A, B = jnp.split(jacobian, [system.num_changes], axis=1)
-    return LinearModel(A, B, system.retract(nominal, change))
+    return LinearModel(*jnp.split(jnp.where(exists, jacobian, jnp.nan), [system.num_changes], axis=1))

@@ -11,7 +11,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from mjxgrad._arrays import instance, known, whole
@@ -127,9 +126,8 @@ class SceneSystem(System):
     @property
     def control_limits(self) -> tuple[ControlVector, ControlVector]:
         """The actuators' `ctrlrange`, infinite where they have none."""
-        model = self.scene.model
-        is_limited, ranges = np.asarray(model.actuator_ctrllimited, bool), model.actuator_ctrlrange
-        return jnp.where(is_limited, ranges[:, 0], -jnp.inf), jnp.where(is_limited, ranges[:, 1], jnp.inf)
+        low, high = self.scene.ctrlrange.T
+        return low, high
 
     def flatten(self, state: State | mjx.Data) -> StateVector:
         """Return a rollout's state as a vector, without time and warm start."""
@@ -140,16 +138,15 @@ class SceneSystem(System):
         begin, resting = arguments_of(self.scene, self._unflattened(law["states"][0]))
         return steer(self.scene, {"time": begin["time"], **resting}, law, self.num_substeps)
 
-    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, ChangeVector, _Jacobian]:
-        """Return C MuJoCo's next state; and no change, NaN if there is no state, with its derivative by state and control."""
+    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, _Jacobian]:
+        """Return C MuJoCo's next state, NaN if it is not finite, and the derivative of its change by state and control."""
         begin, resting = arguments_of(self.scene, self._unflattened(state))
         inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
         # Differences to one side are off by a few roundings of single precision, and take half as long.
         how = {"gradient": self.contact.gradient, "is_centred": state.dtype != jnp.float32}  # pyright: ignore
         how |= {"wanted": ("ctrl", "end"), "num_substeps": self.num_substeps}
         found = linearise(self.scene, begin, inputs, **how)
-        jacobian, end = jnp.concatenate([found["state"], found["ctrl"]], axis=1), found["end"]
-        return end, self.difference(end, end), jacobian
+        return found["end"], jnp.concatenate([found["state"], found["ctrl"]], axis=1)
 
     def _unflattened(self, state: StateVector) -> State:
         nq, nv = self.scene.model.nq, self.scene.model.nv
