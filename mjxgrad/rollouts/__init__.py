@@ -3,4 +3,4 @@
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees
 from mjxgrad.rollouts.linearisation import Linearisation, linearise
 from mjxgrad.rollouts.rollout import rollout
-from mjxgrad.rollouts.state import DivergedError, State, Trajectory, check_trajectory, initial_state
+from mjxgrad.rollouts.state import DivergedError, State, Trajectory, initial_state

@@ -197,20 +197,3 @@ def check_scene(scene: Any) -> None:
 
 class DivergedError(FloatingPointError):
     """A rollout left the range in which its numbers mean anything."""
-
-
-def check_trajectory(trajectory: Trajectory) -> None:
-    """Raise if any rollout of a trajectory, batched or not, has diverged. Call it on the host.
-
-    Raises:
-        DivergedError: with the number of diverged rollouts and the earliest bad step.
-    """
-    diverged = jnp.atleast_1d(trajectory.diverged)
-    if not bool(diverged.any()):
-        return
-    first = int(jnp.min(jnp.where(diverged, jnp.atleast_1d(trajectory.first_bad_step), 2**30)))
-    raise DivergedError(
-        f"{int(diverged.sum())} of {diverged.size} rollouts diverged, the earliest in step {first}: "
-        "the state must stay finite and below 10 000 m/s or rad/s; shorten the time step, soften the contact, "
-        "or look for a non-finite control"
-    )

@@ -109,8 +109,6 @@ def test_divergence_is_flagged_where_it_happens_and_does_not_spread(roll, contro
     assert trajectory.first_bad_step == 2
     expected = _positions(controls[:, 0])
     np.testing.assert_allclose(trajectory.qpos[:, 0], [*expected[:3], *[expected[2]] * 4], atol=1e-14)
-    with pytest.raises(mg.DivergedError, match="1 of 1 rollouts diverged, the earliest in step 2"):
-        mg.check_trajectory(trajectory)
 
 
 def test_a_runaway_velocity_is_a_divergence(roll, controls):
