@@ -109,7 +109,20 @@ class GradientStep(Descent):
         scale, objective = self.annealed(self.objective, carry.params, index)
         estimate = _checked(self.estimator(objective, carry.params, jax.random.fold_in(carry.key, index)))
         change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
-        record = Record.of_estimate(estimate, scale=scale, step_norm=jnp.linalg.norm(change), is_taken=is_taken)
+        dtype = carry.params.dtype
+        record = Record(
+            cost=estimate.objective_mean.astype(dtype),
+            cost_error=estimate.objective_standard_error.astype(dtype),
+            gradient_norm=jnp.linalg.norm(estimate.value),
+            alpha=estimate.alpha.astype(dtype),
+            reason=estimate.reason,
+            scale=scale,
+            step_norm=jnp.linalg.norm(change),
+            finite_fraction=jnp.asarray(estimate.finite_fraction, dtype),
+            num_rollouts=estimate.num_rollouts.astype(jnp.int32),
+            num_gradient_rollouts=estimate.num_gradient_rollouts.astype(jnp.int32),
+            is_taken=is_taken,
+        )
         return self.moved(carry, index, carry.params + change, state, record)
 
     def annealed(

@@ -8,11 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad._text import Paged, Printed, format_range
-from mjxgrad.estimators import GradientEstimate, Reason
+from mjxgrad.estimators import Reason
 from mjxgrad.loop.run import Progress
 from mjxgrad.report import Block, page, svg
 
@@ -69,26 +68,6 @@ class Record(eqx.Module):
         # As an array, like the reasons of steps.
         reason = jax.tree.map(jnp.asarray, Reason.fixed)
         return cls(nan, nan, nan, nan, reason, nan, nan, nan, none, none, jnp.zeros((), bool))
-
-    @classmethod
-    def of_estimate(
-        cls, estimate: GradientEstimate, *, scale: ArrayLike, step_norm: ArrayLike, is_taken: ArrayLike
-    ) -> "Record":
-        """Return the record of a step along an estimate."""
-        dtype = estimate.value.dtype
-        return cls(
-            cost=estimate.objective_mean.astype(dtype),
-            cost_error=estimate.objective_standard_error.astype(dtype),
-            gradient_norm=jnp.linalg.norm(estimate.value),
-            alpha=estimate.alpha.astype(dtype),
-            reason=estimate.reason,
-            scale=jnp.asarray(scale, dtype),
-            step_norm=jnp.asarray(step_norm, dtype),
-            finite_fraction=jnp.asarray(estimate.finite_fraction, dtype),
-            num_rollouts=estimate.num_rollouts.astype(jnp.int32),
-            num_gradient_rollouts=estimate.num_gradient_rollouts.astype(jnp.int32),
-            is_taken=jnp.asarray(is_taken),
-        )
 
 
 class Best(eqx.Module):
