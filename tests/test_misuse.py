@@ -77,11 +77,6 @@ def planned(**how):
     return planning.optimise_trajectory(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), jnp.zeros(2), **given | how)
 
 
-def sampled(**how):
-    given = {"stddev_state": 0.1, "stddev_control": 0.1, "num_samples": 10}
-    return planning.Sampled(**given | how).linear_model(system, jnp.zeros(2), jnp.zeros(2), key)
-
-
 def decided(state=(0.0, 0.0), **how):
     given = {"controls": np.zeros((3, 2))} | how
     return planning.Controller(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), **given)(np.array(state))
@@ -261,9 +256,6 @@ FOUND = {
     "decided(deadline=0.0)": "deadline must be positive, in seconds, or None, got 0.0",
     "decided(state=(0.0, 0.0, 0.0))": "state must have shape (2,) in this system, got (3,)",
     "decided(state=(0.0, np.nan))": "state must be finite, got [0.0, nan]",
-    "sampled(stddev_state=-1.0)": "stddev_state must be at least 0",
-    "sampled(stddev_control=jnp.ones(3))": "stddev_control must be a number or have shape",
-    "sampled(num_samples=4)": "num_samples must be at least 6",
     "system.with_contact(mg.Smoothing(0.1))": "analytic smoothing must be of a SceneSystem, got FunctionSystem",
     # Identification.
     "fit.Recording({'qpos': wrong}, times=[0, 1])": "measured and times of the recording must have the same number",

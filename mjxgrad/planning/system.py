@@ -76,7 +76,7 @@ class System(eqx.Module):
             ValueError: if the system has no contacts.
         """
         raise ValueError(
-            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: take samples, by Sampled"
+            f"analytic smoothing must be of a SceneSystem, got {type(self).__name__}: take a Smoother of your own"
         )
 
 

@@ -87,7 +87,7 @@ class Plan(eqx.Module, Printed):
         if self.unmoved.any():
             return (
                 f"nothing is touched: no control moves the coordinates {np.flatnonzero(self.unmoved).tolist()} of the state, "
-                "which have a cost, so derivatives are zero; start with controls that touch, or smooth by Analytic or Sampled"
+                "which have a cost, so derivatives are zero; start with controls that touch, or smooth by Analytic"
             )
         if self.diverged:
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
