@@ -413,7 +413,7 @@ FOUND = {
     "learn(checkpoint=3)": "checkpoint must be the path of a file, got int",
     "learn(environment=scene)": "environment must be one mg.envs.Environment or several, got Scene",
     "learn(environment=envs.diffrl.CartPole)": "environment must be one mg.envs.Environment or several, got <class",
-    "identify(free_start='yes')": "free_start must be True or False, got str",
+    "identify(free_start='yes')": "free_start must be True, False or None, got str",
     "identify(held_out=fit.Recording({'qpos': five}))": "held_out must be a list of recordings, got Recording",
     "mg.identify(scene.mj_model, {'a': fit.Parameter(1.0)}, [fit.Recording({'qpos': five})])": "scene must be of mg.load_scene",
     "mg.identify(scene, [fit.Parameter(1.0)], [fit.Recording({'qpos': five})])": "parameters must be a dict from names to",
