@@ -203,6 +203,15 @@ def spread(scene: Scene, recordings: Sequence[Recording], free_start: bool | Non
     return found.reshape(len(recordings), -1)
 
 
+def after_start(windows: Windows, spread: Float[np.ndarray, "windows both"]) -> Windows:
+    """Return windows whose first rows do not count where the starts were read from them: their noise is that of the starts."""
+    weight = dict(windows.weight)
+    for name, noise in zip(("qpos", "qvel"), np.split(spread, 2, axis=1), strict=True):
+        if name in weight:
+            weight[name] = weight[name].at[:, 0].multiply(noise == 0)
+    return eqx.tree_at(lambda w: w.weight, windows, weight)
+
+
 def coordinates(model: mjx.Model | mujoco.MjModel) -> list[slice]:
     """Return for each velocity the numbers of a position that it changes: one, or all four of a quaternion."""
     found, (ball, free) = [], (int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE))

@@ -9,7 +9,7 @@ motion fits, or the sum of squares is rugged, the values are those of an ensembl
 import contextlib
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.ensemble import Ensemble, fit
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
-from mjxgrad.identification.recording import STATES, Recording, Windows, residuals, spread, stack
+from mjxgrad.identification.recording import STATES, Recording, Windows, after_start, residuals, spread, stack
 from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
@@ -106,7 +106,9 @@ def identify(
     try:
         is_rugged = _ruggedness(program, end) > _RUGGED
         if is_rugged or _is_off(program, end, has_noise):
-            many = _ensemble(program, 1.0 if has_noise else None, end.num_steps, log)
+            steps = itertools.count(end.num_steps + 1)
+            many = _ensemble(program, 1.0 if has_noise else None, steps, log)
+            end = end._replace(num_steps=next(steps) - 1)
             rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
             is_alone = float(jnp.sum(end.found[0] ** 2)) < _ALONE * many.least or not is_rugged
             if _rms(program, end.found) < _BETTER * rms and is_alone:
@@ -116,16 +118,16 @@ def identify(
     return _identified(program, end, many, held_out, has_noise)
 
 
-def _ensemble(program: "_Program", noise: float | None, num_steps: int, log: Log | None) -> Ensemble:
-    steps = itertools.count(num_steps + 1)
-
+def _ensemble(program: "_Program", noise: float | None, steps: Iterator[int], log: Log | None) -> Ensemble:
     def say(rms: float) -> None:
+        step = next(steps)
         if log is not None:
-            log(next(steps), {"rms": rms, "is_accepted": 1.0})
+            log(step, {"rms": rms, "is_accepted": 1.0})
 
+    windows = after_start(program.windows, program.spread)
     box = [np.where(np.isfinite(x), x, sign) for x, sign in zip(program.coordinates.box(), (-1.0, 1.0), strict=True)]
-    run = lambda points, draws: program.motions(program.windows, points, draws * program.spread)  # noqa: E731
-    return fit(run, (box[0], box[1]), program.spread.shape, program.num_numbers, noise, say)
+    run = lambda points, draws: program.motions(windows, points, draws * program.spread)  # noqa: E731
+    return fit(run, (box[0], box[1]), program.spread.shape, _num_numbers(windows), noise, say)
 
 
 def _is_off(program: "_Program", end: "_End", has_noise: bool) -> bool:
@@ -307,7 +309,8 @@ class _Program:
         """Return the rms residuals of held-out recordings at the nominal values and in the end; None without any."""
         if not held_out:
             return None
-        judged, noise = stack(self.nominal, held_out), spread(self.nominal, held_out, self.free_start)
+        noise = spread(self.nominal, held_out, self.free_start)
+        judged = after_start(stack(self.nominal, held_out), noise)
         ends = self.motions(judged, np.stack([np.zeros(len(point)), point]), np.zeros((2, *noise.shape)))
         if many is not None:
             draws = many.noise * np.random.default_rng(1).normal(size=(len(many.points), *noise.shape))
