@@ -249,13 +249,15 @@ def identify(
     for path in recordings:
         one, unknown = files.recording(loaded, _existing(path), sizes)
         if one.times[-1] > 200 * (len(one.times) - 1) * loaded.mj_model.opt.timestep:  # milliseconds, perhaps
-            log(f"rows of {path} are over 200 time steps of the scene apart: is its time in seconds?")
+            raise CommandError(f"time of {path} must be in seconds, got rows over 200 time steps of the scene apart")
         if unknown:
             left_out.append(f"\nNot of this scene, and left out of {path}: {', '.join(unknown)}.")
             log(left_out[-1].strip())  # a slip is seen before the search
         motions.append(one)
     fitted, judged = files.hold_out(motions, held_out)
-    log(f"{len(wanted)} parameters, {len(fitted)} motions to fit, {len(judged)} held out; compiling")
+    log(
+        f"{len(wanted)} parameters, {len(fitted)} motion{'s' * (len(fitted) > 1)} to fit, {len(judged)} held out; compiling"
+    )
     result = mg.identify(
         loaded,
         wanted,

@@ -21,9 +21,11 @@ def identified_page(
     name: str, scene: Scene, result: Identification, recordings: Sequence[Recording], held_out: Sequence[Recording]
 ) -> str:
     """Return a self-contained page on the search from a scene with the nominal values; needs `mjxgrad[render]`."""
-    condition = f"Condition number {result.condition_number:.2g}: beyond 100, combinations have narrower intervals."
+    condition = f"Condition number {result.condition_number:.2g}: combinations of parameters have narrower intervals."
     head, *rows = result.rows()
-    numbers = Block(faults=result.warnings(), items=[condition], table=Table(head, rows))
+    numbers = Block(
+        faults=result.warnings(), items=[condition] * (result.condition_number > 100), table=Table(head, rows)
+    )
     # The held-out end of a single recording, else the first recording.
     motions = [recordings[0], *(held_out[:1] if len(recordings) == 1 else ())]
     blocks = [_figures(scene, result, motions), numbers, Block(folded="In words", code=result.summary())]

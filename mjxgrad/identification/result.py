@@ -34,6 +34,7 @@ _REMOVED = 1e-3  # of the residuals at the start: less comes from numerical diff
 _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred times
 _DEPARTS = 2.0  # of what is left of the fitted motions
 _BETTER = 0.8  # of the first residuals
+_OVERSTATED = 0.7  # of the noise: 30 numbers have less by chance once in a hundred times
 _CHANCE = 1e-4  # probability that residuals as large are noise
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
 
@@ -173,6 +174,10 @@ class Identification(Printed):
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
                 f"other first values, {free}shorter windows (recording.cut) or more parameters, or correct the noise."
+            )
+        if self.has_noise and self.rms[1] < _OVERSTATED and self.num_numbers >= _ENOUGH:
+            found.append(
+                f"The stated noise is larger than what is left: {self.rms[1]:.2g} of it; some intervals are too wide."
             )
         left = max(self.rms[1], 1.0 if self.has_noise else _REMOVED * self.rms[0])
         if self.held_out_rms is not None and self.held_out_rms[1] > _DEPARTS * left:

@@ -198,6 +198,9 @@ def test_the_command_finds_a_mass_and_writes_what_it_found(tmp_path, monkeypatch
     assert said.startswith("0 of 2 numbers found")
     assert "Cannot be told apart: mass:cart, gear:motor" in said
     assert cli.main(["identify", "cart.xml", "motion.csv", "--parameter", "weight"]) == 2
+    _write("late.csv", **{"time": 10.0 * np.arange(40), "x": place[:40], "motor": drive})  # in milliseconds
+    assert cli.main(["identify", "cart.xml", "late.csv", "--parameter", "mass:cart"]) == 2
+    assert "time of late.csv must be in seconds" in capsys.readouterr().err
 
 
 def test_figures_name_their_signals_as_columns_do(scene):

@@ -230,6 +230,14 @@ def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
     assert right.warnings() == []
 
 
+def test_noise_that_is_overstated_is_told(cart):
+    noise = 1e-3 * np.random.default_rng(0).normal(size=_STEPS + 1)
+    for stated, told in ((1e-3, False), (3e-3, True)):
+        recording = Recording({"place": _course(gear=3.3) + noise}, _DRIVE[:, None], noise={"place": stated})
+        result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording])
+        assert any("larger than what is left" in warning for warning in result.warnings()) == told
+
+
 def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, compilations):
     """The second cart is pulled by 0.2 N that the scene does not know: no gear explains its motion, and chi-square sees it."""
     results = []
