@@ -11,6 +11,7 @@ the bounds, and then about those that fit best (the cross-entropy method).
 References:
     Evensen. Analysis of iterative ensemble smoothers for solving inverse problems. Computational Geosciences 22 (2018).
     Rubinstein, Kroese. The Cross-Entropy Method. Springer 2004.
+    Hartlap, Simon, Schneider. Why your model parameter confidences might be too optimistic. A&A 464 (2007).
 """
 
 from collections.abc import Callable
@@ -102,7 +103,7 @@ def fit(
         covariance *= _LAST**2 if is_last else 1.0
     both, least = model.over_root(size) * size, float((residuals**2).sum(axis=(1, 2)).min())
     residual = both @ np.append(1.0, middle - model.middle)
-    return Ensemble(middle, points, least, size, bool(is_last and fits), residual, both[:, 1:])
+    return Ensemble(middle, points, least, size, bool(is_last and fits), residual, both[:, 1:] * model.sureness(size))
 
 
 class _Draw:
@@ -162,7 +163,7 @@ class _Regression:
     """Residuals of many motions by their points: the mean and its derivative, and the covariance of what is left."""
 
     def __init__(self, points: np.ndarray, residuals: np.ndarray):
-        self.middle = points.mean(axis=0)
+        self.middle, self._count = points.mean(axis=0), len(points)
         away = np.column_stack([np.ones(len(points)), points - self.middle])
         self._columns = np.einsum("dm,mwn->wnd", np.linalg.pinv(away), residuals)
         left = residuals - np.einsum("md,wnd->mwn", away, self._columns)
@@ -196,6 +197,11 @@ class _Regression:
         """Return twice the negative logarithm of the likelihood of a noise of this size, up to a constant."""
         determinant = sum(np.log1p(variances / size**2).sum() for variances in self._variances)
         return 2 * count * np.log(size) + determinant + self.solved(size, prior)[2]
+
+    def sureness(self, size: float) -> float:
+        """Return the factor of derivatives for a covariance of few motions, whose inverse is too large (Hartlap et al.)."""
+        directions = np.mean([(variances / (size**2 + variances)).sum() for variances in self._variances])
+        return float(np.sqrt(max(1.0 - directions / self._count, 0.1)))
 
     def over_root(self, size: float) -> Float[np.ndarray, "numbers dim"]:
         """Return the residual at the middle and its derivative, over the root of the covariance."""
