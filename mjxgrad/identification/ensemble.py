@@ -93,12 +93,12 @@ def fit(
         misfits.append(misfit)
         length = np.sqrt(step @ np.linalg.pinv(covariance, hermitian=True) @ step)
         step *= _LONGEST / max(length, _LONGEST)
-        middle, fits = np.clip(model.middle + step, *box), misfit < _FITS[draw.is_full] * count
+        middle, fits = np.clip(model.middle + step, *box), misfit < _FITS[draw.size == draw.most] * count
         if (is_last and fits) or min(misfits) < min(misfits[-_PATIENCE:]) or len(misfits) == _MOST_ENSEMBLES:
             break
         before, covariance = covariance, _WIDER**2 * max(misfit / count, 1.0) * inverse + np.outer(step, step)
-        if not fits:
-            draw.grow()
+        if not fits:  # the covariance of few motions lacks directions
+            draw.size = min(2 * draw.size, draw.most)
         is_last = length < _SHORT and fits and (np.diag(before) < _SETTLED**2 * np.diag(covariance)).all()
         covariance *= _LAST**2 if is_last else 1.0
     both, least = model.over_root(size) * size, float((residuals**2).sum(axis=(1, 2)).min())
@@ -114,26 +114,18 @@ class _Draw:
     ):
         self._motions, self._box, self._starts, self.noise = motions, box, starts, noise
         fewest = _PER_NUMBER * len(box[0])
-        self._size, self._most = (max(fewest, min(number, int(_MOST_NUMBERS / count))) for number in _NUM_MOTIONS)
+        self.size, self.most = (max(fewest, min(number, int(_MOST_NUMBERS / count))) for number in _NUM_MOTIONS)
         self._rng = np.random.default_rng(0)
-
-    @property
-    def is_full(self) -> bool:
-        return self._size == self._most
-
-    def grow(self) -> None:
-        """Draw more motions from now on, for the covariance of few lacks directions."""
-        self._size = min(2 * self._size, self._most)
 
     def __call__(
         self, middle: np.ndarray | None = None, covariance: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return points and residuals of the motions that stay finite."""
         if middle is None or covariance is None:
-            points = self._rng.uniform(*self._box, (self._size, len(self._box[0])))
+            points = self._rng.uniform(*self._box, (self.size, len(self._box[0])))
             points[0] = 0.0  # the nominal values, at which no motion diverges
         else:
-            points = np.clip(self._rng.multivariate_normal(middle, covariance, self._size, method="eigh"), *self._box)
+            points = np.clip(self._rng.multivariate_normal(middle, covariance, self.size, method="eigh"), *self._box)
         residuals = self._motions(points, self.noise * self._rng.normal(size=(len(points), *self._starts)))
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
         if is_finite.sum() < 2 * points.shape[1] + 2:
