@@ -37,13 +37,14 @@ def _speeds(xml: str) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("contact", "turn", "is_exact"),
-    [("", "", True), (_SOFT, "", True), (_SOFT, "", False), ("", "", False), ("", _TURN, True)],
+    [("", "", True), (_SOFT, "", True), (_SOFT, "", False), ("", "", False), ("", _TURN, True), ("", _TURN, False)],
     ids=[
         "default contact, which chatters",
         "soft contact",
         "noisy starts, soft contact",
         "noisy starts, default contact",
         "default contact, corner by corner",
+        "noisy starts, default contact, corner by corner",
     ],
 )
 def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn, is_exact):
