@@ -166,7 +166,7 @@ class Identification(Printed):
         found = []
         if self.stopped is Stopped.STALLED:
             found.append(
-                "Stalled: the mean of many motions does not settle. Give shorter windows (recording.cut) or softer contact."
+                "Stalled: the mean of many motions does not settle. Give narrower bounds, shorter windows or softer contact."
             )
         if self.has_noise and self._is_unexplained:
             free = "" if self.offsets is not None or self.num_motions > 1 else "free_start=True, "

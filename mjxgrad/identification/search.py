@@ -115,6 +115,8 @@ def identify(
                 many = None
     except KeyboardInterrupt:
         end = end._replace(stopped=Stopped.INTERRUPTED)
+    except DivergedError:  # most motions between the bounds
+        end = end._replace(stopped=Stopped.STALLED)
     return _identified(program, end, many, held_out, has_noise)
 
 

@@ -48,10 +48,19 @@ def test_an_interrupted_search_returns_the_best_values_so_far(cart):
     assert "interrupted: do not trust" in result.headline
 
 
-def test_an_interruption_of_the_second_search_keeps_the_first_ones_values(cart, monkeypatch):
-    monkeypatch.setattr("mjxgrad.identification.search.fit", _interrupted)
+@pytest.mark.parametrize(
+    ("error", "stopped"), [(KeyboardInterrupt, Stopped.INTERRUPTED), (mg.DivergedError, Stopped.STALLED)]
+)
+def test_a_second_search_that_fails_keeps_the_first_ones_values(cart, monkeypatch, error, stopped):
+    """Interrupted, or since most motions diverge between the bounds."""
+
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr("mjxgrad.identification.search.fit", fails)
     result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [_noisy()])
-    assert result.stopped is Stopped.INTERRUPTED
+    assert result.stopped is stopped
+    assert not result.is_sound
     np.testing.assert_allclose(result.values["gear"], 3.3, atol=0.1)
 
 
