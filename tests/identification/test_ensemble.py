@@ -9,7 +9,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad.identification import Recording
 from mjxgrad.identification.ensemble import fit
-from mjxgrad.identification.recording import spread
+from mjxgrad.identification.recording import after_start, spread, stack
 
 _NUMBERS, _WINDOWS, _TRUE = 60, 2, np.array([0.3, -0.2])
 
@@ -85,4 +85,8 @@ def test_the_start_is_as_noisy_as_the_first_row_that_gives_it():
     measured = np.repeat([0.001, 0, 0.001, 0], [2, 4, 1, 7])
     np.testing.assert_array_equal(spread(scene, [one, given, late], None), [measured, 0 * measured, 0 * measured])
     np.testing.assert_array_equal(spread(scene, [given], True), [measured])
+    counted = after_start(stack(scene, [one]), spread(scene, [one], None)).weight["qpos"][0, :, [0, 1, 6]]
+    np.testing.assert_allclose(
+        counted, np.tile([0, 1000, 1000], (3, 1))
+    )  # the first row is the start, and no measurement
     np.testing.assert_array_equal(spread(scene, [one], False), [0 * measured])
