@@ -57,7 +57,10 @@ class Ensemble(NamedTuple):
 
     def judged(self, residuals: Float[np.ndarray, "motions windows rows"]) -> Float[np.ndarray, " numbers"]:
         """Return the residual at the point in the same way, from those of the motions for these or other recordings."""
-        model = _Regression(self.points, residuals)
+        is_finite = np.isfinite(residuals).all(axis=(1, 2))
+        if is_finite.sum() < 2 * self.points.shape[1] + 2:
+            return np.full(residuals[0].size, np.inf)
+        model = _Regression(self.points[is_finite], residuals[is_finite])
         return model.over_root(self.noise) @ np.append(1.0, self.point - model.middle) * self.noise
 
 

@@ -71,6 +71,10 @@ def test_motions_that_diverge_do_not_count_unless_most_do():
     box, shape = (-np.ones(2), np.ones(2)), (_WINDOWS, 3)
     found = fit(functools.partial(diverging, 3), box, shape, _WINDOWS * _NUMBERS, 1.0, lambda rms: None)
     np.testing.assert_allclose(found.point, _TRUE, atol=0.1)
+    residuals = motions(found.points, np.zeros((len(found.points), *shape)))
+    some = np.where(np.arange(len(residuals))[:, None, None] > 9, residuals, np.nan)
+    assert np.isfinite(found.judged(some)).all()
+    assert np.isinf(found.judged(np.full_like(residuals, np.inf))).all()
     with pytest.raises(mg.DivergedError, match="between the bounds, got few"):
         fit(functools.partial(diverging, 10), box, shape, _WINDOWS * _NUMBERS, 1.0, lambda rms: None)
 
