@@ -162,9 +162,8 @@ def _identified(
     else:
         point, signals, residual, num_offsets = jnp.asarray(many.point), many.residual, many.residual, 0
         slope = many.slope / np.asarray(coordinates.scale, float)
-        stopped = (
-            stopped if stopped is Stopped.INTERRUPTED else Stopped.CONVERGED if many.is_settled else Stopped.STALLED
-        )
+        if stopped is not Stopped.INTERRUPTED:
+            stopped = Stopped.CONVERGED if many.is_settled else Stopped.STALLED
     values = np.asarray(coordinates.values(point.astype(coordinates.nominal.dtype)), float)
     signals = signals.reshape(*program.windows.index.shape, -1)
     verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
