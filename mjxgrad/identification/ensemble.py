@@ -24,6 +24,7 @@ from mjxgrad.rollouts import DivergedError
 
 # Motions of an ensemble at first and at most, at least for each parameter, and numbers at most, for memory.
 _NUM_MOTIONS, _PER_NUMBER, _MOST_NUMBERS = (512, 2048), 20, 1e8
+_NUM_ALONE, _MOST_ALONE = 4096, 32  # motions, of which some alone nearly fit, and those kept
 _MOST_ENSEMBLES, _PATIENCE = 20, 8  # ensembles at most, and since the misfit last fell
 # Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
 MISFIT = 1.5
@@ -49,7 +50,9 @@ class Ensemble(NamedTuple):
 
     point: Float[np.ndarray, " dim"]
     points: Float[np.ndarray, "motions dim"]
-    least: float  # sum of squares of the single motion that fits best
+    alone: list[
+        tuple[np.ndarray, np.ndarray]
+    ]  # points and changes of the starts of single motions, the best ones first
     noise: float  # its size, 1 where it is known
     is_settled: bool
     residual: Float[np.ndarray, " numbers"]  # at the point, over the root of the covariance, times the noise
@@ -87,7 +90,7 @@ def fit(
     prior = np.diag(12.0 / (box[1] - box[0]) ** 2)  # the variance of a point between the bounds
     is_last, misfits = False, []
     while True:
-        points, residuals = draw(middle, covariance)
+        points, _, residuals = draw(middle, covariance)
         model = _Regression(points, residuals)
         sizes = [noise] if noise else first * _SIZES
         draw.noise = size = min(sizes, key=lambda one: model.deviance(one, count, prior))
@@ -104,9 +107,9 @@ def fit(
             draw.size = min(2 * draw.size, draw.most)
         is_last = length < _SHORT and fits and (np.diag(before) < _SETTLED**2 * np.diag(covariance)).all()
         covariance *= _LAST**2 if is_last else 1.0
-    both, least = model.over_root(size) * size, float((residuals**2).sum(axis=(1, 2)).min())
+    both, alone = model.over_root(size) * size, draw.alone(middle, covariance)
     residual = both @ np.append(1.0, middle - model.middle)
-    return Ensemble(middle, points, least, size, bool(is_last and fits), residual, both[:, 1:] * model.sureness(size))
+    return Ensemble(middle, points, alone, size, bool(is_last and fits), residual, both[:, 1:] * model.sureness(size))
 
 
 class _Draw:
@@ -122,25 +125,36 @@ class _Draw:
 
     def __call__(
         self, middle: np.ndarray | None = None, covariance: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return points and residuals of the motions that stay finite."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return points, changes of the starts, and residuals of the motions that stay finite."""
         if middle is None or covariance is None:
             points = self._rng.uniform(*self._box, (self.size, len(self._box[0])))
             points[0] = 0.0  # the nominal values, at which no motion diverges
         else:
             points = np.clip(self._rng.multivariate_normal(middle, covariance, self.size, method="eigh"), *self._box)
-        residuals = self._motions(points, self.noise * self._rng.normal(size=(len(points), *self._starts)))
+        starts = self.noise * self._rng.normal(size=(len(points), *self._starts))
+        residuals = self._motions(points, starts)
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
         if is_finite.sum() < 2 * points.shape[1] + 2:
             raise DivergedError("most motions must stay finite between the bounds, got few: give narrower ones")
-        return points[is_finite], residuals[is_finite]
+        return points[is_finite], starts[is_finite], residuals[is_finite]
+
+    def alone(self, middle: np.ndarray, covariance: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return points and changes of the starts of the single motions that fit best, each window's start by itself."""
+        found = []
+        for _ in range(max(_NUM_ALONE // self.size, 1)):
+            points, starts, residuals = self(middle, covariance)
+            found.append((points, starts, (residuals**2).sum(axis=2)))
+        points, starts, squares = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        order = np.argsort(squares, axis=0)[:_MOST_ALONE]
+        return [(points[best].mean(axis=0), starts[best, np.arange(len(best))]) for best in order]
 
 
 def _narrowed(
     draw: _Draw, count: int, noise: float | None, log: Callable[[float], None]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the nominal root mean square, and mean and covariance of points that fit best, by the cross-entropy method."""
-    points, residuals = draw()
+    points, _, residuals = draw()
     first, medians = float(np.sqrt((residuals[0] ** 2).sum() / count)), [np.inf]
     scale = _SCALE * noise if noise else _SCALE_OF_FIRST * first
     while True:
@@ -151,7 +165,7 @@ def _narrowed(
         log(float(np.sqrt((residuals[best] ** 2).sum(axis=(1, 2)).min() / count)))
         if medians[-1] > _STILL_FALLS * medians[-2] or len(medians) > _MOST_ENSEMBLES:
             return first, middle, covariance
-        points, residuals = draw(middle, covariance)
+        points, _, residuals = draw(middle, covariance)
 
 
 class _Regression:

@@ -35,7 +35,7 @@ _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred tim
 _DEPARTS = 2.0  # of what is left of the fitted motions
 _BETTER = 0.8  # of the first residuals
 _OVERSTATED = 0.7  # of the noise: 30 numbers have less by chance once in a hundred times
-_CHANCE = 1e-4  # probability that residuals as large are noise
+CHANCE = 1e-4  # probability that residuals as large are noise
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
 
 
@@ -223,11 +223,12 @@ def statistics(
     slope: Float[np.ndarray, "numbers dim"],
     num_numbers: int,
     num_offsets: int,
+    away: Float[np.ndarray, "dim dim"] | float = 0.0,
 ) -> dict[str, Any]:
     """Return the fields of `Identification` that residuals at the end and their derivative tell, half widths as a vector.
 
     The derivative is by the values, orthogonal to the effect of the starts, which are `num_offsets` more unknowns. Of the
-    residuals `num_numbers` are measurements.
+    residuals `num_numbers` are measurements. The second moment of other values that fit as well is `away`.
     """
     rounding = float(np.finfo(np.asarray(coordinates.nominal).dtype).eps)
     lengths = np.linalg.norm(slope, axis=0)
@@ -242,6 +243,7 @@ def statistics(
     variance = residual @ residual / freedom
     covariance = np.full((len(values), len(values)), np.nan)
     covariance[np.ix_(is_felt, is_felt)] = variance * spread.T @ spread
+    covariance += away
     lost = ~is_felt
     lost[np.flatnonzero(is_felt)[(blurred**2).sum(axis=0) > _NO_PART**2]] = True
     covariance[lost], covariance[:, lost] = np.nan, np.nan
@@ -257,9 +259,9 @@ def statistics(
     }
 
 
-def exceeds_noise(rms: float, freedom: int) -> bool:
+def exceeds_noise(rms: float, freedom: int, chance: float = CHANCE) -> bool:
     """Return whether residuals in units of the noise are larger than chance allows (chi-square)."""
-    return bool(scipy.special.chdtrc(max(freedom, 1), rms**2 * max(freedom, 1)) < _CHANCE)
+    return bool(scipy.special.chdtrc(max(freedom, 1), rms**2 * max(freedom, 1)) < chance)
 
 
 def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) -> tuple[dict[str, float], ...]:

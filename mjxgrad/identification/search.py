@@ -17,24 +17,26 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from jaxtyping import Array
+import scipy.special
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.identification.ensemble import Ensemble, fit
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import STATES, Recording, Windows, after_start, residuals, spread, stack
-from mjxgrad.identification.result import Identification, Stopped, exceeds_noise, on_host, statistics
+from mjxgrad.identification.result import CHANCE, Identification, Stopped, exceeds_noise, on_host, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
 Log = Callable[[int, dict[str, float]], None]
 _TOO_LITTLE = 1e-3  # gain of a step at the end, of the noise variance
-_LEFT = 0.3  # of the first residuals
+_LEFT, _DOUBT = 0.3, 0.05  # of the first residuals; chance of noise alone, below which better values are sought
 _NUM_AWAY, _CLEAR = 5, 1e-10  # points a standard error away; share of the largest curvature that counts
 _RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretell
-_BETTER, _ALONE = 1.1, 0.5  # the residuals, the sum of squares of one motion, over the ensemble's at most
+_BETTER = 1.1  # residuals of one motion over the ensemble's at most
+_SHORT, _AGREE = 10, 4  # steps of a descent from a motion that nearly fits; ends alike at which no better one is sought
 _MOST_AT_ONCE, _SIDE_BY_SIDE = 256, 64  # motions in one call, and in one batch, for memory
 
 
@@ -98,25 +100,27 @@ def identify(
         has_sensors = any(set(one.measured) - set(STATES) for one in (*recordings, *held_out))
         contact = Discrete(None if has_sensors or scene.data.qpos.dtype == np.float64 else "mujoco")
     program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
-    end = _descend(program, max_steps, log)
+    steps = itertools.count(1)
+    end = _descend(program, program.start(), steps, max_steps, log)
     has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
     if end.stopped is Stopped.INTERRUPTED:
         return _identified(program, end, None, held_out, has_noise)
-    many = None
+    many, noise = None, 1.0 if has_noise else None
     try:
         is_rugged = _ruggedness(program, end) > _RUGGED
-        if is_rugged or _is_off(program, end, has_noise):
-            steps = itertools.count(end.num_steps + 1)
-            many = _ensemble(program, 1.0 if has_noise else None, steps, log)
-            end = end._replace(num_steps=next(steps) - 1)
+        if is_rugged or _is_off(program, end, noise, _DOUBT):
+            many = _ensemble(program, noise, steps, log)
+            end = _alone(program, end, many, steps, max_steps, log)
             rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
-            is_alone = float(jnp.sum(end.found[0] ** 2)) < _ALONE * many.least or not is_rugged
-            if _rms(program, end.found) < _BETTER * rms and is_alone:
+            if not _is_off(program, end, many.noise):
+                many, end = None, end._replace(stopped=Stopped.CONVERGED)
+            elif not is_rugged and _rms(program, end.found) < _BETTER * rms:
                 many = None
     except KeyboardInterrupt:
         end = end._replace(stopped=Stopped.INTERRUPTED)
     except DivergedError:  # most motions between the bounds
         end = end._replace(stopped=Stopped.STALLED)
+    end = end._replace(num_steps=next(steps) - 1)
     return _identified(program, end, many, held_out, has_noise)
 
 
@@ -132,11 +136,38 @@ def _ensemble(program: "_Program", noise: float | None, steps: Iterator[int], lo
     return fit(run, (box[0], box[1]), program.spread.shape, _num_numbers(windows), noise, say)
 
 
-def _is_off(program: "_Program", end: "_End", has_noise: bool) -> bool:
-    """Return whether a descent left more than noise; if that is not known, whether it explained little."""
+def _alone(
+    program: "_Program", end: "_End", many: Ensemble, steps: Iterator[int], max_steps: int, log: Log | None
+) -> "_End":
+    """Return the best end of descents from the motions that fit best.
+
+    The sum of squares has many minima, by noisy starts or by chatter. Others' distances, weighed by likelihood, are what the
+    covariance about one of them lacks. It may also be too large, beyond the minimum: the ensemble's derivative bounds it.
+    """
+    ends, squares, count = [end], [float("inf")], len(program.coordinates.names)
+    total = lambda one: float(jnp.sum(one.found[0] ** 2)) / many.noise**2  # noqa: E731
+    for values, starts in many.alone:
+        squares, left = [total(one) for one in ends], max_steps - sum(one.num_steps for one in ends)
+        if left < 1 or sum(one < min(squares) + 1 for one in squares) >= _AGREE:
+            break
+        with contextlib.suppress(DivergedError):
+            ends.append(_descend(program, program.point(values, starts), steps, min(left, _SHORT), log))
+        if ends[-1].stopped is Stopped.INTERRUPTED:
+            raise KeyboardInterrupt
+    _, first = np.unique(np.round([total(one) for one in ends], 1), return_index=True)  # the best one first
+    ends = [ends[i] for i in first]
+    values = np.stack([np.asarray(program.coordinates.values(one.point[:count]), float) for one in ends])
+    weights = scipy.special.softmax([-total(one) / 2 for one in ends])
+    away = values - values[0]
+    by_many = many.slope / np.asarray(program.coordinates.scale, float)
+    return ends[0]._replace(first=end.first, away=np.einsum("k,ki,kj->ij", weights, away, away), by_many=by_many)
+
+
+def _is_off(program: "_Program", end: "_End", noise: float | None, chance: float = CHANCE) -> bool:
+    """Return whether a descent left more than noise has by chance; if that is not known, whether it explained little."""
     after = _rms(program, end.found)
-    if has_noise:
-        return exceeds_noise(after, program.num_numbers - len(program.start()))
+    if noise:
+        return exceeds_noise(after / noise, program.num_numbers - len(program.start()), chance)
     return after > _LEFT * end.first
 
 
@@ -148,6 +179,8 @@ class _End(NamedTuple):
     num_steps: int
     stopped: Stopped
     first: float  # root mean square of the residuals at the start
+    away: Float[np.ndarray, "dim dim"] | float = 0.0  # second moment of the distances to other ends
+    by_many: Float[np.ndarray, "numbers dim"] | None = None  # the ensemble's derivative
 
 
 def _identified(
@@ -159,6 +192,9 @@ def _identified(
     if many is None:
         point, (residual, slope, num_offsets) = end.point[:count], _without_offsets(*on_host(end.found))
         signals = np.asarray(end.found[0], float)
+        slope = max(
+            slope, slope if end.by_many is None else end.by_many, key=lambda one: np.linalg.slogdet(one.T @ one)
+        )
     else:
         point, signals, residual, num_offsets = jnp.asarray(many.point), many.residual, many.residual, 0
         slope = many.slope / np.asarray(coordinates.scale, float)
@@ -166,7 +202,7 @@ def _identified(
             stopped = Stopped.CONVERGED if many.is_settled else Stopped.STALLED
     values = np.asarray(coordinates.values(point.astype(coordinates.nominal.dtype)), float)
     signals = signals.reshape(*program.windows.index.shape, -1)
-    verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets)
+    verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets, end.away)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     nominal = np.asarray(coordinates.nominal, float)
     is_at_bound = coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype))
@@ -289,6 +325,11 @@ class _Program:
         """Return the point of the nominal values, with starts as they were given: zero."""
         return jnp.zeros(len(self.coordinates.names) + self._sizes.size, self.coordinates.nominal.dtype)
 
+    def point(self, values: np.ndarray, starts: np.ndarray) -> Array:
+        """Return the point of these coordinates, and of changes of the starts in units of their noise."""
+        free = (starts * self.spread)[:, self._free] / np.where(self._sizes > 0, self._sizes, 1.0)
+        return jnp.asarray(np.concatenate([values, free.ravel()]), self.coordinates.nominal.dtype)
+
     def box(self) -> tuple[Array, Array]:
         """Return the bounds of a point; starts are unbounded."""
         free = jnp.full(self._sizes.size, jnp.inf)
@@ -328,9 +369,9 @@ def _num_numbers(windows: Windows) -> int:
     return sum(int((np.asarray(weight) > 0).sum()) for weight in windows.weight.values())
 
 
-def _descend(program: _Program, max_steps: int, log: Log | None) -> _End:
-    """Minimise the residuals from the nominal values, until an interruption at most."""
-    point, tolerance = program.start(), float(np.sqrt(jnp.finfo(program.start().dtype).eps))
+def _descend(program: _Program, point: Array, steps: Iterator[int], max_steps: int, log: Log | None) -> _End:
+    """Minimise the residuals from a point, until an interruption at most."""
+    tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     end = best = _End(point, program(point), 0, Stopped.INTERRUPTED, 0.0)
     first = _rms(program, best.found)
     if not np.isfinite(first):
@@ -348,8 +389,9 @@ def _descend(program: _Program, max_steps: int, log: Log | None) -> _End:
             rms = _rms(program, found)
             is_better = not best.num_steps or rms < _rms(program, best.found)
             best = end if is_better else best
+            step = next(steps)
             if log is not None:
-                log(end.num_steps, {"rms": rms, "is_accepted": float(is_better)})
+                log(step, {"rms": rms, "is_accepted": float(is_better)})
             residual, slope = _linear_model(program, found)
             is_finite = np.isfinite(residual).all() and np.isfinite(slope).all()
             factor = np.linalg.qr(np.column_stack([slope, residual]) / size, mode="r") if is_finite else np.inf
