@@ -1,5 +1,6 @@
 """Parameters come back from motions that were made with them, as surely as the noise allows."""
 
+import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -167,7 +168,7 @@ def test_starts_and_a_delay_are_found_with_the_parameter(cart):
     np.testing.assert_allclose(result.offsets, starts, atol=1e-6)
 
 
-def test_through_a_bounce_a_descent_stalls_without_an_onset_and_many_motions_find_it():
+def test_through_a_bounce_a_descent_stalls_without_an_onset_and_goes_on_from_the_best_of_many_motions():
     """The height of a drop from the simulation's own course after the impact, to which both come back exactly.
 
     The place then moves by −0.14 m per metre of height, and is a sawtooth of −2.4 without an onset.
@@ -191,9 +192,10 @@ def test_through_a_bounce_a_descent_stalls_without_an_onset_and_many_motions_fin
         found[name] = mg.identify(scene, {"height": Parameter(0.3, 0.1, 0.5, raised)}, [recording], contact=contact)
     assert found["onset"].stopped is Stopped.CONVERGED
     np.testing.assert_allclose(found["onset"].values["height"], 0.25, atol=1e-6)
-    np.testing.assert_allclose(found["discrete"].values["height"], 0.25, atol=1e-6)
-    assert found["onset"].num_motions == 1
-    assert f"the mean of {found['discrete'].num_motions} motions is fitted" in found["discrete"].summary()
+    np.testing.assert_allclose(found["discrete"].values["height"], 0.25, atol=1e-12)
+    assert found["onset"].num_motions == found["discrete"].num_motions == 1
+    many = dataclasses.replace(found["discrete"], num_motions=512)
+    assert "the mean of 512 motions is fitted" in many.summary()
 
 
 def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_angle():

@@ -65,5 +65,5 @@ def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn,
         half = np.array([result.half_width["friction"], result.half_width["mass"]])
         covered += np.abs(error) <= half
         assert result.is_sound or (turn and not is_exact), result.summary()  # chatter that is not normal may stall it
-        assert (result.num_motions > 1) == (contact != _SOFT)
+        assert result.num_motions == 1 or contact != _SOFT
     assert (covered >= 17).all(), covered
