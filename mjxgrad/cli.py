@@ -1,5 +1,6 @@
 """The command line: check and sweep a scene, find its parameters, begin a program."""
 
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -211,7 +212,8 @@ def identify(
     parameter: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")],
     noise: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")] = [],  # noqa: B006
     held_out: float = 0.2,
-    free_start: Annotated[bool, cyclopts.Parameter(negative="")] = False,
+    start: Literal["noisy", "exact", "free"] = "noisy",
+    max_steps: int = 100,
     output: Path = Path("identified"),
 ) -> int:
     """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
@@ -230,7 +232,9 @@ def identify(
         noise: name=standard deviation, of every measured column, or of qpos, qvel and sensors as a whole. Then the answer says
             whether more than noise is left; by default each signal is weighed by how much it varies.
         held_out: share for validation only: every n-th recording, or the end of a single one.
-        free_start: find what the first row lacks of the start, too, such as speeds; otherwise it is the scene's pose, at rest.
+        start: as the first row says, as noisy as that, and what it lacks is the scene's pose, at rest; exactly this pose, at
+            rest; or all unknown, to be found, too.
+        max_steps: largest number of simulations with derivatives.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
@@ -253,7 +257,7 @@ def identify(
         if unknown:
             left_out.append(f"\nNot of this scene, and left out of {path}: {', '.join(unknown)}.")
             log(left_out[-1].strip())  # a slip is seen before the search
-        motions.append(one)
+        motions.append(dataclasses.replace(one, start=mg.initial_state(loaded)) if start == "exact" else one)
     fitted, judged = files.hold_out(motions, held_out)
     log(
         f"{len(wanted)} parameters, {len(fitted)} motion{'s' * (len(fitted) > 1)} to fit, {len(judged)} held out; compiling"
@@ -264,7 +268,8 @@ def identify(
         fitted,
         held_out=judged,
         delay="delay" if "delay" in wanted else None,
-        free_start=free_start or None,
+        free_start=True if start == "free" else None,
+        max_steps=max_steps,
         log=lambda step, metrics: log(f"step {step}: error {metrics['rms']:.3g} {unit}"),
     )
     print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)

@@ -33,10 +33,12 @@ def identified_page(
 
 
 def _figures(scene: Scene, result: Identification, motions: Sequence[Recording]) -> Block:
-    """Draw the signals of the last motion, sorted by how much the search changed them."""
+    """Draw those signals of the last motion that the search changed most."""
     window = jax.tree.map(lambda leaf: leaf[0], stack(scene, motions[-1:]))
-    run = jax.jit(lambda scene, delay: simulated(scene, window, None, delay)[0])
-    courses = [run(s, v.get("delay", 0.0)) for s, v in ((scene, result.start), (result.scene, result.values))]
+    run = jax.jit(lambda scene, delay, offset: simulated(scene, window, offset, delay)[0])
+    found = None if result.offsets is None else result.offsets[0]
+    ends = (scene, result.start, None), (result.scene, result.values, found)
+    courses = [run(scene, values.get("delay", 0.0), offset) for scene, values, offset in ends]
     before, after = jax.tree.map(np.asarray, courses)
     times = np.concatenate([motion.times for motion in motions])
     fitted_until = float(motions[0].times[-1]) if len(motions) > 1 else None
@@ -49,9 +51,9 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
                 old, new = before[name][:, i], after[name][:, i]
                 change = np.abs(new - old).max() / max(np.ptp(values[known]), 1e-12)
                 signals.append((change, names.get((name, i), name), times[known], values[known], old, new))
-    signals.sort(key=lambda one: -one[0])
+    least = sorted(one[0] for one in signals)[-_MOST_SIGNALS:][0]
     panel = functools.partial(_panel, float(scene.model.opt.timestep), fitted_until)
-    drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals[:_MOST_SIGNALS]]
+    drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals if one[0] >= least]
     chatters = " as one of many motions, since contacts chatter" * (result.num_motions > 1)
     caption = f"SI units. Dots: measured. Dashed: where the search began. Line: with the values found{chatters}. Grey: held out."
     if len(signals) > len(drawings):

@@ -112,7 +112,11 @@ def identify(
             many = _ensemble(program, noise, steps, log)
             end = _alone(program, end, many, steps, max_steps, log)
             rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
-            if not _is_off(program, end, many.noise):
+            residual, slope, _ = _without_offsets(*on_host(end.found))
+            tells_more = _told(residual, slope * np.asarray(program.coordinates.scale)) > _told(
+                many.residual, many.slope
+            )
+            if tells_more and not _is_off(program, end, many.noise):
                 many, end = None, end._replace(stopped=Stopped.CONVERGED)
             elif not is_rugged and _rms(program, end.found) < _BETTER * rms:
                 many = None
@@ -142,7 +146,7 @@ def _alone(
     """Return the best end of descents from the motions that fit best.
 
     The sum of squares has many minima, by noisy starts or by chatter. Others' distances, weighed by likelihood, are what the
-    covariance about one of them lacks. It may also be too large, beyond the minimum: the ensemble's derivative bounds it.
+    covariance about one of them lacks.
     """
     ends, squares, count = [end], [float("inf")], len(program.coordinates.names)
     total = lambda one: float(jnp.sum(one.found[0] ** 2)) / many.noise**2  # noqa: E731
@@ -159,8 +163,12 @@ def _alone(
     values = np.stack([np.asarray(program.coordinates.values(one.point[:count]), float) for one in ends])
     weights = scipy.special.softmax([-total(one) / 2 for one in ends])
     away = values - values[0]
-    by_many = many.slope / np.asarray(program.coordinates.scale, float)
-    return ends[0]._replace(first=end.first, away=np.einsum("k,ki,kj->ij", weights, away, away), by_many=by_many)
+    return ends[0]._replace(first=end.first, away=np.einsum("k,ki,kj->ij", weights, away, away))
+
+
+def _told(residual: np.ndarray, slope: np.ndarray) -> float:
+    """Return the logarithm of the determinant of the information on the values, the inverse of their covariance."""
+    return float(np.linalg.slogdet(slope.T @ slope / (np.mean(residual**2) + np.finfo(float).tiny))[1])
 
 
 def _is_off(program: "_Program", end: "_End", noise: float | None, chance: float = CHANCE) -> bool:
@@ -180,7 +188,6 @@ class _End(NamedTuple):
     stopped: Stopped
     first: float  # root mean square of the residuals at the start
     away: Float[np.ndarray, "dim dim"] | float = 0.0  # second moment of the distances to other ends
-    by_many: Float[np.ndarray, "numbers dim"] | None = None  # the ensemble's derivative
 
 
 def _identified(
@@ -192,9 +199,6 @@ def _identified(
     if many is None:
         point, (residual, slope, num_offsets) = end.point[:count], _without_offsets(*on_host(end.found))
         signals = np.asarray(end.found[0], float)
-        slope = max(
-            slope, slope if end.by_many is None else end.by_many, key=lambda one: np.linalg.slogdet(one.T @ one)
-        )
     else:
         point, signals, residual, num_offsets = jnp.asarray(many.point), many.residual, many.residual, 0
         slope = many.slope / np.asarray(coordinates.scale, float)
@@ -214,9 +218,7 @@ def _identified(
         at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
         rms=(end.first, float(np.linalg.norm(residual) / np.sqrt(numbers))),
         has_noise=has_noise,
-        held_out_rms=None
-        if stopped is Stopped.INTERRUPTED
-        else program.held_out_rms(held_out, end.point[:count], many),
+        held_out_rms=None if stopped is Stopped.INTERRUPTED else program.held_out_rms(held_out, end.point, many),
         offsets=program.offsets(end.point) if many is None else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
         num_motions=1 if many is None else len(many.points),
@@ -352,8 +354,13 @@ class _Program:
         if not held_out:
             return None
         noise = spread(self.nominal, held_out, self.free_start)
-        judged = after_start(stack(self.nominal, held_out), noise)
-        ends = self.motions(judged, np.stack([np.zeros(len(point)), point]), np.zeros((2, *noise.shape)))
+        judged, count = after_start(stack(self.nominal, held_out), noise), len(self.coordinates.names)
+        starts, found = np.zeros((2, *noise.shape)), self.offsets(point)
+        if many is None and found is not None:  # the end of a recording has the start that was found for its beginning
+            both = (np.hstack([one.state.qpos, one.state.qvel]) for one in (judged, self.windows))
+            is_same = (next(both)[:, None] == next(both)).all(axis=2) & noise.any(axis=1)[:, None]
+            starts[1] = np.where(is_same.any(axis=1)[:, None], found[is_same.argmax(axis=1)], 0.0)
+        ends = self.motions(judged, np.stack([np.zeros(count), point[:count]]), starts)
         if many is not None:
             draws = many.noise * np.random.default_rng(1).normal(size=(len(many.points), *noise.shape))
             ends = [ends[0], many.judged(self.motions(judged, many.points, draws * noise))]

@@ -1,6 +1,7 @@
 """Parameters come back from motions that were made with them, as surely as the noise allows."""
 
 import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
