@@ -113,10 +113,8 @@ def identify(
             end = _alone(program, end, many, steps, max_steps, log)
             rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
             residual, slope, _ = _without_offsets(*on_host(end.found))
-            tells_more = _told(residual, slope * np.asarray(program.coordinates.scale)) > _told(
-                many.residual, many.slope
-            )
-            if tells_more and not _is_off(program, end, many.noise):
+            told = _told(residual, slope * np.asarray(program.coordinates.scale), np.finfo(float).tiny)
+            if told > _told(many.residual, many.slope, many.noise**2) and not _is_off(program, end, many.noise):
                 many, end = None, end._replace(stopped=Stopped.CONVERGED)
             elif not is_rugged and _rms(program, end.found) < _BETTER * rms:
                 many = None
@@ -166,9 +164,9 @@ def _alone(
     return ends[0]._replace(first=end.first, away=np.einsum("k,ki,kj->ij", weights, away, away))
 
 
-def _told(residual: np.ndarray, slope: np.ndarray) -> float:
-    """Return the logarithm of the determinant of the information on the values, the inverse of their covariance."""
-    return float(np.linalg.slogdet(slope.T @ slope / (np.mean(residual**2) + np.finfo(float).tiny))[1])
+def _told(residual: np.ndarray, slope: np.ndarray, least: float) -> float:
+    """Return the logarithm of the determinant of the information on the values, by a variance of the noise of this at least."""
+    return float(np.linalg.slogdet(slope.T @ slope / max(np.mean(residual**2), least))[1])
 
 
 def _is_off(program: "_Program", end: "_End", noise: float | None, chance: float = CHANCE) -> bool:
@@ -357,8 +355,8 @@ class _Program:
         judged, count = after_start(stack(self.nominal, held_out), noise), len(self.coordinates.names)
         starts, found = np.zeros((2, *noise.shape)), self.offsets(point)
         if many is None and found is not None:  # the end of a recording has the start that was found for its beginning
-            both = (np.hstack([one.state.qpos, one.state.qvel]) for one in (judged, self.windows))
-            is_same = (next(both)[:, None] == next(both)).all(axis=2) & noise.any(axis=1)[:, None]
+            begins, known = (np.hstack([one.state.qpos, one.state.qvel]) for one in (judged, self.windows))
+            is_same = np.all(begins[:, None] == known, axis=2) & noise.any(axis=1, keepdims=True)
             starts[1] = np.where(is_same.any(axis=1)[:, None], found[is_same.argmax(axis=1)], 0.0)
         ends = self.motions(judged, np.stack([np.zeros(count), point[:count]]), starts)
         if many is not None:

@@ -262,3 +262,18 @@ def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, com
     assert len(compilations) == before
     assert not results[0].warnings()
     assert f"{results[2].rms[1]:.3g} times the noise" in results[2].summary()
+
+
+def test_the_end_of_a_recording_is_foretold_from_the_start_that_was_found_for_its_beginning(cart):
+    """The first row says 0.15 m/s, give or take 0.05, the rest that it was 0.1: the difference is 15 mm at the end."""
+    place = _course(v=0.1) + 1e-3 * np.random.default_rng(0).normal(size=_STEPS + 1)
+    speed, is_late = np.where(np.arange(_STEPS + 1) > 0, np.nan, 0.15), np.arange(_STEPS + 1) > 30
+    parts = [{"place": np.where(one, place, np.nan), "qvel": speed} for one in (~is_late, is_late)]
+    noise = {"place": 1e-3, "qvel": 0.05}
+    early, late = (Recording(one, _DRIVE[:, None], noise=noise) for one in parts)
+    gear = {"gear": identification.gear(cart, "motor")}
+    result = mg.identify(cart, gear, [early], held_out=[late])
+    np.testing.assert_allclose(result.offsets[0, 1], -0.05, atol=0.01)
+    assert result.held_out_rms[1] < 3 < result.held_out_rms[0]
+    other = dataclasses.replace(late, measured={**parts[1], "qvel": speed + 1e-6})
+    assert mg.identify(cart, gear, [early], held_out=[other]).held_out_rms[1] > 5
