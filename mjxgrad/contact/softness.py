@@ -98,14 +98,14 @@ class Softness(eqx.Module):
         """
         everything = contact_pairs(model)
         if self.pairs is not None:
-            return named_pairs(everything, self.pairs, "softness.pairs")
+            return named_pairs(everything, self.pairs, "pairs")
         if self.geoms is None:
             return everything
         known = {name for pair in everything for name in pair.names}
         for name in self.geoms:
             if name not in known:
                 raise ValueError(
-                    f"softness.geoms must name geoms that can touch another, got {name!r}; "
+                    f"geoms must name geoms that can touch another, got {name!r}; "
                     f"those that can: {', '.join(sorted(known)) or 'none'}"
                 )
         return tuple(pair for pair in everything if set(pair.names) & set(self.geoms))

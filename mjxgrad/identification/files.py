@@ -116,6 +116,7 @@ def recording(
     missing = ~np.isfinite(controls)
     if bad := np.flatnonzero(missing.any(axis=0)).tolist():
         names = ", ".join(scene.mj_model.actuator(i).name or f"[{i}]" for i in bad)
+        names += "".join(f" (is it {one}?)" for one in difflib.get_close_matches(names, unknown, 1))
         row = int(missing[:, bad].any(axis=1).argmax())
         lacks = f"it lacks {names}" + f" from {times[row]:g} s" * (not missing[:, bad].all())
         raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; {lacks}")

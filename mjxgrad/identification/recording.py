@@ -27,7 +27,7 @@ class Recording:
 
     Attributes:
         measured: measurements by sensor name, or as "qpos", "qvel" or "act": one row per time, NaN for none.
-        controls: the controls, one row per time step of the scene or per entry of `control_times`; None for none.
+        controls: the controls, one row per time step of the scene or per entry of `control_times`; None without actuators.
         times: times of the measurements from the start (s), increasing; None for one at each state.
         control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
@@ -238,6 +238,10 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
 
 
 def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:
+    if recording.controls is None and scene.model.nu:
+        raise ValueError(
+            f"controls of {recording.name} must be given in a scene with actuators, zeros for rest, got none"
+        )
     if recording.controls is None:
         return np.broadcast_to(np.asarray(scene.data.ctrl), (num_steps, scene.model.nu))
     controls = np.asarray(recording.controls, float)

@@ -72,6 +72,7 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
         ({"time": [], "place": []}, "must have at least two rows of numbers, got 0"),
         ({"time": [0, 1], "x": [1, 2]}, "must say what it is, as one of ctrl:x, qpos:x"),
         ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo"),
+        ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0], "servos": [0, 0]}, "is it servos"),
         ({"time": [0, 1], "ctrl:x": [0, 0], "servo": [0, 0], "palce": [1, 2]}, "did you mean place"),
         ({"time": [0, "soon"], "x": [1, 2]}, "a line of names, then numbers.*line 3: could not"),
         ({"time": [0, 1], "qpos:palce": [1, 2]}, "qpos:palce, which is not of this scene; did you mean qpos:"),
