@@ -123,12 +123,7 @@ def displacements(model: mjx.Model) -> tuple[np.ndarray, np.ndarray]:
 
 def moving_dofs(model: mjx.Model) -> np.ndarray:
     """Return 1 where a joint velocity moves a body, else 0 (nbody, nv)."""
-    moves = np.zeros((model.nbody, model.nv))
-    for body in range(1, model.nbody):
-        moves[body] = moves[model.body_parentid[body]]
-        first = model.body_dofadr[body]
-        moves[body, first : first + model.body_dofnum[body]] = 1
-    return moves
+    return descendants(model)[model.dof_bodyid].T
 
 
 def earlier_dofs(model: mjx.Model) -> np.ndarray:
@@ -148,7 +143,7 @@ def earlier_dofs(model: mjx.Model) -> np.ndarray:
     return earlier
 
 
-def descendants(model: mjx.Model) -> np.ndarray:
+def descendants(model: mjx.Model | mujoco.MjModel) -> np.ndarray:
     """Return 1 where a body (column) is a descendant of another (row) or the same, else 0 (nbody, nbody)."""
     below = np.eye(model.nbody)
     for body in range(model.nbody - 1, 0, -1):

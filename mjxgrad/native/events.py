@@ -56,6 +56,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.sparse.csgraph import connected_components
 
+from mjxgrad.bodies import tree
+
 _LEAST_WIDTH = 0.06  # of the impedance's width
 _BOUNCE, _SMALLEST = 10.0, 1e-6  # by how many steps' accelerations contacts bounce, squared (m or rad)
 _HAIR = 6e-5  # m, over which the geometry of contacts is averaged
@@ -270,9 +272,7 @@ def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
     """Return how far each joint velocity moves the farthest point below it, for each body that it moves (m or 1)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    is_below = np.eye(model.nbody, dtype=bool)  # whether a body, by column, is another or hangs below it
-    for body in range(1, model.nbody):
-        is_below[:, body] |= is_below[:, model.body_parentid[body]]
+    is_below = tree.descendants(model) > 0
     radius = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 0.0, model.geom_rbound)
     levers = np.zeros((model.nbody, model.nv))
     for dof, joint in enumerate(model.dof_jntid.tolist()):
