@@ -93,7 +93,7 @@ def _choose_jvp(primals, tangents):
 
 def dot(a: Float[Array, "n k"], b: Float[Array, "n k"]) -> Float[Array, " n"]:
     """Return the scalar product of each item."""
-    return _products(a.shape[1])(a, b)[:, 0]
+    return Bilinear(np.eye(a.shape[1])[None])(a, b)[:, 0]
 
 
 @jax.custom_jvp
@@ -105,18 +105,8 @@ def scale(factor: Float[Array, " n"], x: Float[Array, "n k"]) -> Float[Array, "n
 @scale.defjvp
 def _scale_jvp(primals, tangents):
     (factor, x), (change, dx) = primals, tangents
-    scaled = _multiples(x.shape[1])
+    scaled = Bilinear(np.eye(x.shape[1])[:, None])
     return scale(factor, x), scaled(change[:, None], x) + scaled(factor[:, None], dx)
-
-
-@functools.cache
-def _products(size: int) -> Bilinear:
-    return Bilinear(np.eye(size)[None])
-
-
-@functools.cache
-def _multiples(size: int) -> Bilinear:
-    return Bilinear(np.eye(size)[:, None])
 
 
 def contract(subscripts: str, a: Array, b: Array) -> Array:
