@@ -67,7 +67,6 @@ _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(2, 0, 1)
 QUATERNION = _quaternion_table()
 cross = Bilinear(_CROSS)
 """a × b."""
-_cross_matrix = Bilinear(_CROSS.transpose(0, 2, 1).reshape(9, 3, 1))
 _multiply = Bilinear(QUATERNION)
 _rotation = Bilinear(_rotation_table())
 cross_motion = Bilinear(_motion_table())
@@ -78,11 +77,6 @@ momentum = Bilinear(_momentum_table())
 """Inertia times motion."""
 # |o|² m - o (m o)ᵀ, as entries, from o and m o.
 _steiner = Bilinear(np.array([(i == j) * np.eye(3) - np.outer(np.eye(3)[i], np.eye(3)[j]) for i, j in _ENTRIES]))
-
-
-def cross_matrix(a: _Vectors) -> _Matrices:
-    """Return the matrix of x ↦ a × x."""
-    return _cross_matrix(a, jnp.ones((len(a), 1), a.dtype)).reshape(-1, 3, 3)
 
 
 def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:

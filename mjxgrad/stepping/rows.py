@@ -201,9 +201,8 @@ def contact_jacobian(
     turning, moving = data.cdof[:, :3], data.cdof[:, 3:]
     # A joint velocity moves both sides alike, about the same point if they have the same root.
     sign, arm = signs[:, 0] + signs[:, 1], maps.contract("csv,csx->cvx", signs, lever)
-    point = maps.contract("cv,vx->cvx", sign, moving) + maps.contract(
-        "vxy,cvy->cvx", spatial.cross_matrix(turning), arm
-    )
+    turned = spatial.cross(jnp.broadcast_to(turning, arm.shape), arm)
+    point = maps.contract("cv,vx->cvx", sign, moving) + turned
     rows = maps.contract("ckx,cvx->ckv", frame[:, : min(dim, 3)], point)
     if dim > 3:
         spin = maps.contract("cv,vx->cvx", sign, turning)
