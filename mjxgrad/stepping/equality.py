@@ -3,6 +3,8 @@
 Connect and weld subtract the drift J̇ v, the relative acceleration of moving bodies without joint accelerations. MJX lacks it.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,7 +17,7 @@ from mjxgrad.batched.maps import safe_norm
 from mjxgrad.bodies import kinematics, spatial, tree
 from mjxgrad.contact.law import impedance
 from mjxgrad.solver.jacobian import DenseRows
-from mjxgrad.stepping.rows import Block, contact_jacobian, per_row
+from mjxgrad.stepping.rows import Block, contact_jacobian
 
 _Column = Float[Array, " n"]
 _Ends = Float[Array, "constraints 2 3"]
@@ -46,19 +48,19 @@ def _block(
     drift: Float[Array, "constraints k"] | None = None,
 ) -> Block:
     """Return the block of constraints with k rows each; their impedance is that of the residual's norm."""
-    each = residual.shape[1]
+    spread = functools.partial(jnp.repeat, repeats=residual.shape[1], axis=0)
     flat = residual.reshape(-1)
     zero = jnp.zeros_like(flat)
     return Block(
         map=DenseRows(jacobian.reshape(flat.size, -1)),
         residual=flat,
-        impedance=jax.tree.map(lambda x: per_row(x, each), impedance(model.eq_solimp[ids], safe_norm(residual))),
-        solimp=per_row(model.eq_solimp[ids], each),
+        impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], safe_norm(residual))),
+        solimp=spread(model.eq_solimp[ids]),
         inverse_weight=inverse_weight.reshape(-1),
-        solref=per_row(model.eq_solref[ids], each),
+        solref=spread(model.eq_solref[ids]),
         margin=zero,
         friction_loss=zero,
-        is_active=per_row(jnp.asarray(data.eq_active)[ids] != 0, each),
+        is_active=spread(jnp.asarray(data.eq_active)[ids] != 0),
         drift=None if drift is None else drift.reshape(-1),
     )
 

@@ -73,7 +73,7 @@ from mjxgrad.contact.collision import WITHOUT_CENTRE, are, is_blind, other_sides
 from mjxgrad.contact.law import Impedance, stiffness_damping
 from mjxgrad.solver.jacobian import RowMap
 from mjxgrad.solver.newton import Variant
-from mjxgrad.stepping.rows import Block, joined, law, per_row, row_map, weight_of
+from mjxgrad.stepping.rows import Block, joined, law, row_map, weight_of
 
 _Vector = Float[Array, " nv"]
 _PerRow = Float[Array, " rows"]
@@ -186,7 +186,7 @@ def begin(
         geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
         num_contacts += count if block.is_contact else 0
         share, side = _share(model, data, block, how, geoms)
-        share = per_row(share, each)
+        share = jnp.repeat(share, each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(dataclasses.replace(block, is_active=share > 0, impedance=impedance))
@@ -326,7 +326,7 @@ def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_S
     if any(side is not None for side in sides):
         present = jnp.concatenate(
             [
-                jnp.ones_like(share) if side is None else per_row(side.share, block.rows_each)
+                jnp.ones_like(share) if side is None else jnp.repeat(side.share, block.rows_each)
                 for block, share, side in zip(blocks, shares, sides, strict=True)
             ]
         )

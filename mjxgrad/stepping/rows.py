@@ -76,11 +76,6 @@ def weight_of(block: Block, impedance: _PerRow) -> _PerRow:
     return 1 / jnp.maximum(block.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
 
 
-def per_row(x: Array, each: int) -> Array:
-    """Repeat the value of each contact, limit or constraint for each of its rows."""
-    return jnp.repeat(x, each, axis=0)
-
-
 def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     """Return the rows of all contacts of one dimension.
 
@@ -99,7 +94,7 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
     distance = contact.dist - contact.includemargin
     is_pyramid, count = has_pyramids(model, dim), len(distance)
     each = 2 * (dim - 1) if is_pyramid else dim
-    spread = functools.partial(per_row, each=each)
+    spread = functools.partial(jnp.repeat, repeats=each, axis=0)
     if is_pyramid:
         mu2 = contact.friction[:, 0] ** 2
         inverse_weight = spread(inverse_weight * (1 + mu2) * 2 * mu2 / model.opt.impratio)

@@ -43,7 +43,7 @@ from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.solver import noise as normal
 from mjxgrad.solver.constraint import Noise, RowLayout
-from mjxgrad.stepping.rows import Block, per_row
+from mjxgrad.stepping.rows import Block
 
 Mode = Literal["forward", "backward"]
 
@@ -130,7 +130,7 @@ def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothi
     distance = jnp.where(known, block.residual[::each], 1.0)
     # Impedance at the mean of -(r + w) given that it is positive (m).
     resistance = impedance(block.solimp[::each], length * normal.depth(distance / length))
-    spread = functools.partial(per_row, each=each)
+    spread = functools.partial(jnp.repeat, repeats=each, axis=0)
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)
     is_present, impedances = spread(known), jax.tree.map(spread, resistance)
