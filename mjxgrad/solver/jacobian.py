@@ -139,7 +139,7 @@ class AxisRows(RowMap):
         return self.sign * maps.pick(np.array(self.dofs), velocity)
 
     def rmv(self, force):
-        return combine(_selection(self.dofs, self.num_dofs).T, self.sign * force)
+        return combine(np.eye(self.num_dofs)[:, list(self.dofs)], self.sign * force)
 
     def directions(self):
         return [self.sign[:, None, None]]
@@ -300,7 +300,7 @@ def dense(
     rows = []
     for group, entries, mu in zip(groups, pieces, friction, strict=True):
         if group.is_diagonal:
-            selection = _selection(group.dofs, num_dofs)
+            selection = np.eye(num_dofs)[list(group.dofs)]
             own = entries[:, 0] * selection.reshape(*selection.shape, *(1,) * (entries.ndim - 3))
         else:
             own = edges(_spread(entries, group.dofs, num_dofs), None if mu is None else mu[:, :, None])
@@ -355,7 +355,3 @@ def _spread(
         at = target.stop
     columns.append(jnp.zeros((*entries.shape[:2], num_dofs - at, *entries.shape[3:]), entries.dtype))
     return jnp.concatenate(columns, axis=2)
-
-
-def _selection(dofs: tuple[int, ...], num_dofs: int) -> np.ndarray:
-    return (np.array(dofs, int)[:, None] == np.arange(num_dofs)).astype(float)
