@@ -52,9 +52,8 @@ def gather(model: mjx.Model, data: mjx.Data) -> list[Block]:
     return [block for block in blocks if block is not None]
 
 
-def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block] | None = None) -> mjx.Data:
-    """Fill the `efc_` fields from rows, which are gathered if not given; a drop-in for `mjx.make_constraint`."""
-    blocks = gather(model, data) if blocks is None else blocks
+def make_constraint(model: mjx.Model, data: mjx.Data, blocks: list[Block]) -> mjx.Data:
+    """Fill the `efc_` fields from rows, as `mjx.make_constraint` does."""
     if not blocks:
         empty = jnp.zeros(0, data.qpos.dtype)
         fields = dict.fromkeys(("D", "aref", "frictionloss", "pos", "margin"), empty)

@@ -66,7 +66,7 @@ def test_rows_are_those_of_mjx(cone):
     model, data = zoo(cone, welded=True)
     mjx_model = mjx.put_model(model)
     ready = jax.jit(lambda d: mjx.fwd_position(mjx_model, d))(mjx.put_data(model, data))
-    ours = jax.jit(lambda d: assembly.make_constraint(mjx_model, d))(ready)._impl
+    ours = jax.jit(lambda d: assembly.make_constraint(mjx_model, d, assembly.gather(mjx_model, d)))(ready)._impl
     theirs = jax.jit(lambda d: mjx.make_constraint(mjx_model, d))(ready)._impl
     for name in ("efc_J", "efc_D", "efc_aref", "efc_pos", "efc_margin", "efc_frictionloss"):
         first = 12 if name == "efc_aref" else 0
