@@ -171,23 +171,13 @@ class ActorCritic(Method):
         """Run a window in all environments, on all devices, and differentiate its return."""
         shape = (self.settings.num_environments, self.settings.window, self.environment.num_actions)
         noise = jax.random.normal(key, shape, environments.obs.dtype)
-
         arrays, structure = eqx.partition(self.environment, eqx.is_array)
 
         def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
-            arrays, actor, critic, normaliser, stddev = shared
+            arrays, *others = shared
             own = eqx.combine(arrays, structure)
-            networks = (actor, critic, normaliser)
-            return window_gradients(
-                own,
-                state,
-                model_key,
-                noise,
-                *networks,
-                stddev,
-                self.settings.discount,
-                self.settings.trace,
-            )
+            weights = {"discount": self.settings.discount, "trace": self.settings.trace}
+            return window_gradients(own, state, model_key, noise, *others, **weights)
 
         # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
         shared = (arrays, learner.policy.actor, learner.target, learner.normaliser, stddev)
