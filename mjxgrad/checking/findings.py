@@ -27,8 +27,6 @@ _CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
 _FEWEST_TEETH = 4
 _DISAGREES = 0.1  # relative difference beyond which the slopes at two time steps disagree
 
-"""Arguments of `mg.rollout` and tasks, by kind of derivative."""
-
 
 @dataclass(frozen=True)
 class Finding:
