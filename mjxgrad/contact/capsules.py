@@ -42,11 +42,6 @@ def has_formula(key: Any) -> bool:
     return second in (_SPHERE, _CAPSULE) and first in (_PLANE, _SPHERE, _CAPSULE)
 
 
-def parallel_below(dtype: Any) -> float:
-    """Return the squared sine below which axes count as parallel, and the nearest point is the middle of the first."""
-    return max(1e-6, float(jnp.finfo(dtype).eps) ** 0.5)
-
-
 def find(model: mjx.Model, data: mjx.Data, groups: Mapping[Any, _Group]) -> dict[Any, Found]:
     """Return the contacts of groups of pairs; all pairs of a group have the same two types."""
     found: dict[Any, Found] = {}
@@ -83,8 +78,10 @@ def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Fo
     cosine, ahead, behind = _products(
         jnp.concatenate([axis, other_axis], axis=1), jnp.concatenate([other_axis, apart], axis=1)
     ).T
-    across, parallel = cross(axis, other_axis), parallel_below(axis.dtype)
+    across = cross(axis, other_axis)
     sine2 = dot(across, across)
+    # Below this squared sine axes count as parallel, and the nearest point is the middle of the first.
+    parallel = max(1e-6, float(jnp.finfo(axis.dtype).eps) ** 0.5)
     # 1 / sin² up to the fourth power of parallel / (sin² + parallel), and bounded by 4 / parallel.
     ratio = parallel / (sine2 + parallel)
     sharpness = (1 + ratio) * (1 + ratio**2) / (sine2 + parallel)
