@@ -149,12 +149,11 @@ def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[i
 
 # Compiled as one program: one operation after another takes seconds for the first scene of a kind.
 @eqx.filter_jit
-def contact_parameters(model: mjx.Model, pairs: Pairs | None = None) -> ContactParameters:
-    """Compute the effective parameters of pairs, one row each; by default of all that can touch.
+def contact_parameters(model: mjx.Model, pairs: Pairs) -> ContactParameters:
+    """Compute the effective parameters of pairs, one row each.
 
     Differentiable with respect to the model's leaves, and traceable.
     """
-    pairs = contact_pairs(model) if pairs is None else pairs
     solref, solimp, friction, margin = _mix(model, pairs)
     stiffness, damping = stiffness_damping(model, solref)
     return ContactParameters(
