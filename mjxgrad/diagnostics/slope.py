@@ -152,7 +152,9 @@ def _column(u: np.ndarray, half: float, y: np.ndarray, slopes: Float[np.ndarray,
         return {**nothing, "num_finite": count}
     u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
     weight = 1 - u**2
-    lever = _lever(u, weight) / half
+    # The weights whose product with an outcome is the slope of the weighted straight line.
+    centred = u - (weight @ u) / weight.sum()
+    lever = weight * centred / (weight @ centred**2) / half
     # A trend of degree 3, since curvature is no error of the slope.
     rest = _residuals(u, y, weight, 3)
     # By parts, the slope is a mean of secants between neighbours; trapezoids of the same weights give the derivatives' mean.
@@ -172,12 +174,6 @@ def _column(u: np.ndarray, half: float, y: np.ndarray, slopes: Float[np.ndarray,
         "spread": slopes.std(axis=1, ddof=1),
         "num_finite": count,
     }
-
-
-def _lever(u: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the weights whose product with an outcome is the slope of the weighted straight line."""
-    centred = u - (weight @ u) / weight.sum()
-    return weight * centred / (weight @ centred**2)
 
 
 def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
