@@ -98,7 +98,8 @@ class Parts(eqx.Module):
 
     def evidence(self) -> Evidence:
         """Return the evidence for a rule, with all coordinates as one block."""
-        missed, explained = self.secants.missed_variance(), self.linear_variance / jnp.maximum(self.num_costs, 1)
+        missed = self.secants.missed / self.secants.pairs  # NaN without pairs
+        explained = self.linear_variance / jnp.maximum(self.num_costs, 1)
         bound = jnp.sqrt(missed / jnp.where(explained > 0, explained, jnp.nan))
         return Evidence.of(
             self.first,

@@ -130,16 +130,12 @@ class SecantSums(eqx.Module):
 
     residual: Float[Array, ""]  # squared residuals over squared distances, in standard deviations of the noise
     difference: Float[Array, ""]  # squared differences of costs over the same squared distances
-    missed: Float[Array, ""]  # half the squared residuals
+    missed: Float[Array, ""]  # half the squared residuals: over the pairs, the variance of what derivatives miss
     pairs: Float[Array, ""]  # number of pairs
 
     def inconsistency(self) -> Float[Array, ""]:
         """Return the share of the squared secants that derivatives do not explain; zero where they explain all."""
         return jnp.where(self.residual > 0, self.residual / jnp.maximum(self.difference, self.residual * 1e-6), 0)
-
-    def missed_variance(self) -> Float[Array, ""]:
-        """Return the variance of the part of the cost that derivatives miss; NaN without pairs."""
-        return self.missed / self.pairs
 
 
 def secant_sums(samples: Group, slopes: _Pairs) -> SecantSums:

@@ -41,7 +41,7 @@ def test_the_sums_are_those_of_the_definition(key):
             difference += (costs[j] - costs[k]) ** 2 / distance
             missed += rest**2 / 2
     np.testing.assert_allclose(sums.inconsistency(), residual / difference, rtol=1e-9)
-    np.testing.assert_allclose(sums.missed_variance(), missed / (40 * 39), rtol=1e-9)
+    np.testing.assert_allclose(sums.missed / sums.pairs, missed / (40 * 39), rtol=1e-9)
 
 
 def test_a_sample_without_derivative_is_compared_with_none(key):
