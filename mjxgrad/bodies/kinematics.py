@@ -201,19 +201,17 @@ class Bodies(eqx.Module):
     """The mass matrix as a product over bodies, applied without being formed.
 
     M a is computed as in `rne`: sums over ancestors give the bodies' accelerations, their inertias the forces, and sums over
-    descendants the joint forces. The derivative has the same form. `moves` lists the joint velocities that move each body.
+    descendants the joint forces. The derivative has the same form. `moves` is `tree.moving_dofs`.
     """
 
     inertia: Float[Array, "nbody 10 *batch"]
     axes: Float[Array, "nv 6 *batch"]
     armature: Float[Array, "nv *batch"]
-    moves: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    moves: tuple[tuple[float, ...], ...] = eqx.field(static=True)
 
     def apply(self, acceleration: _Vector) -> _Vector:
         """Return M a."""
-        moves = np.zeros((len(self.moves), len(self.axes)))
-        for row, dofs in zip(moves, self.moves, strict=True):
-            row[list(dofs)] = 1
+        moves = np.array(self.moves)
         motion = combine(moves, maps.scale(acceleration, self.axes))
         force = spatial.momentum(self.inertia, motion)
         return maps.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
@@ -245,7 +243,7 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
     if model.ntendon or data._impl.M.ndim == 1:
         # The armature of tendons is not in `Bodies`, and the sparse format is MJX's.
         return Inertia(matrix)
-    moves = tuple(tuple(int(dof) for dof in np.nonzero(row)[0]) for row in tree.moving_dofs(model))
+    moves = tuple(map(tuple, tree.moving_dofs(model).tolist()))
     armature = jnp.asarray(model.dof_armature, matrix.dtype)
     return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
 
