@@ -237,7 +237,7 @@ def slopes(measured: Measured) -> tuple[Slope, ...]:
 
 
 def recommend(
-    scene: Scene, motions: Motions, stability: StabilityReport, measured: Measured | None, max_contacts: int | None
+    motions: Motions, stability: StabilityReport, measured: Measured | None, max_contacts: int | None
 ) -> Recommendation:
     """Return the recommended settings from measurements; without measurements, safe ones."""
     needed = [_largest_step(spring) for spring in _steps_too_long(stability)]

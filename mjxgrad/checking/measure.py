@@ -275,7 +275,7 @@ class _Probe:
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
         first, zeroth = estimates(found.outcomes, found.derivatives, scores[:, :, None])
         times = np.array(self.lengths) * self.motions.timestep
-        return Noise(stddev, stiffness, first, zeroth, _crossover(times, first, zeroth))
+        return Noise(stddev, stiffness, first, zeroth, crossover(times, first, zeroth))
 
 
 def estimates(costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -289,21 +289,15 @@ def estimates(costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray) ->
     return derivatives, (costs - baselines) * scores
 
 
-def _crossover(times: np.ndarray, first: np.ndarray, zeroth: np.ndarray) -> float:
-    """Return the time from which single zeroth-order samples are as accurate, with equal weight for all outcomes."""
+def crossover(times: np.ndarray, first: np.ndarray, zeroth: np.ndarray) -> float:
+    """Return the time from which zeroth-order samples are as accurate for good, infinite for none; outcomes count alike."""
     if np.isnan(first).any():
         return float(times[0])
     squares = [((one - zeroth.mean(axis=0)) ** 2).mean(axis=0) for one in (first, zeroth)]
     weight = np.where(squares[1] > _UNFELT**2 * squares[1].max(), squares[1], np.inf)
-    return crossing(times, *((square / weight).sum(axis=1) for square in squares))
-
-
-def crossing(
-    times: Float[np.ndarray, " times"], first: Float[np.ndarray, " times"], second: Float[np.ndarray, " times"]
-) -> float:
-    """Return the time from which the second of two mean squared errors is at most the first for good; infinite for none."""
     tiny = np.finfo(float).tiny  # two errors of zero are equal
-    log_ratio = np.log(np.maximum(first, tiny)) - np.log(np.maximum(second, tiny))
+    of_first, of_zeroth = (np.log(np.maximum((square / weight).sum(axis=1), tiny)) for square in squares)
+    log_ratio = of_first - of_zeroth
     if not (log_ratio < 0).any():
         return float(times[0])
     last = int(np.flatnonzero(log_ratio < 0)[-1])

@@ -15,7 +15,7 @@ import mjxgrad as mg
 from mjxgrad.checking import findings
 from mjxgrad.checking.check import telling
 from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
-from mjxgrad.checking.measure import Line, Measured, crossing, estimates, measure
+from mjxgrad.checking.measure import Line, Measured, crossover, estimates, measure
 from mjxgrad.checking.motions import KINDS, REFINED, Direction, Moved, Mover, most_contacts, random_motions
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
@@ -136,7 +136,7 @@ def measuring():
     def measured_by(mover):
         return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=lambda _: None)
 
-    return measured_by, lambda measured: recommend(scene, motions, stability, measured, None)
+    return measured_by, lambda measured: recommend(motions, stability, measured, None)
 
 
 class OutOfTime(Mover):
@@ -341,12 +341,16 @@ def test_a_slope_of_the_time_step_alone_is_named():
     assert not [one for one in measured_findings(line_of(1.0, 1.0)) if "shorter" in one.text]
 
 
-def test_errors_cross_where_the_second_becomes_smaller_for_good():
+def test_errors_cross_where_those_of_zeroth_order_become_smaller_for_good():
     """e^(t − 6.5) and 1 cross at 6.5; a draw before does not count."""
-    times, ones = np.linspace(1.0, 10.0, 10), np.ones(10)
-    assert crossing(times, np.where(times == 2, 1.5, np.exp(times - 6.5)), ones) == pytest.approx(6.5)
-    assert crossing(times, ones, 2 * ones) == np.inf
-    assert crossing(times, 2 * ones, ones) == 1.0
+    times, signs = np.linspace(1.0, 10.0, 10), np.array([1.0, -1.0])[:, None, None]
+
+    def cross(*squares):
+        return crossover(times, *(signs * np.sqrt(square * np.ones((10, 1))) for square in squares))
+
+    assert cross(np.where(times == 2, 1.5, np.exp(times - 6.5))[:, None], 1) == pytest.approx(6.5)
+    assert cross(1, 2) == np.inf
+    assert cross(2, 1) == 1.0
 
 
 def test_an_exploding_derivative_is_named():
