@@ -43,11 +43,8 @@ _PLANE, _HEIGHT_FIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _BOX, _CYLINDER, _MESH = (
     for name in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "BOX", "CYLINDER", "MESH")
 )
 CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
-_OF_ROUND = {
-    _SPHERE: 1,
-    _ELLIPSOID: 1,
-    _CAPSULE: 2,
-}  # contacts with another convex geom; of flat faces C MuJoCo finds four
+# Contacts with another convex geom; of flat faces C MuJoCo finds four.
+_OF_ROUND = {_SPHERE: 1, _ELLIPSOID: 1, _CAPSULE: 2}
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """Types without a bounding sphere."""
 _DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])

@@ -147,9 +147,8 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
                 raise ValueError(f"qpos must have a quaternion that is not zero, got zeros for {name}")
         elif has_limits and model.jnt_limited[joint]:
             unit, value, (low, high) = units[int(kind)], pose[first], ranges[joint]
-            slack = 1e-6 * max(1.0, abs(value)) + _HARMLESS * (
-                high - low
-            )  # single precision's rounding; noise of starts
+            # Single precision's rounding; noise of starts.
+            slack = 1e-6 * max(1.0, abs(value)) + _HARMLESS * (high - low)
             if not low - slack <= value <= high + slack:
                 yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
     if of_file is None:

@@ -164,12 +164,8 @@ def _coupling(model: mjx.Model, data: mjx.Data, ids: np.ndarray) -> Block:
     """Return rows x₁ - p(x₂) for pairs of joints or tendons; without a second one x₂ = 0."""
     places = dofs = (model.eq_obj1id[ids], model.eq_obj2id[ids])
     if model.eq_type[ids[0]] == mujoco.mjtEq.mjEQ_TENDON:
-        present, rest, entries, weights = (
-            data.ten_length,
-            model.tendon_length0,
-            data._impl.ten_J,
-            model.tendon_invweight0,
-        )
+        present, rest, weights = data.ten_length, model.tendon_length0, model.tendon_invweight0
+        entries = data._impl.ten_J
     else:
         places, dofs = ([table[joint] for joint in places] for table in (model.jnt_qposadr, model.jnt_dofadr))
         present, rest, weights = data.qpos, model.qpos0, model.dof_invweight0
