@@ -154,10 +154,8 @@ class Surfaces:
         """Return the displacement after which changes of this size cross no surface, or None, and whether rounding decides."""
         mujoco.mj_fwdPosition(self.model, data)
         # Most positions are far from all, which these few operations tell.
-        if (
-            not data.nefc
-            or np.abs(data.efc_pos - data.efc_margin + self.contact_reach).min() > 4 * change * self.longest
-        ):
+        all_gaps = data.efc_pos - data.efc_margin + self.contact_reach
+        if np.abs(all_gaps).min(initial=np.inf) > 4 * change * self.longest:
             return None, False
         _, rows, gaps, least, jumps = self._gaps(data)
         is_moved = self._moves(rows)
