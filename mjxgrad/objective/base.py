@@ -109,7 +109,7 @@ class Objective(eqx.Module):
     def noise_shape(self) -> tuple[int, ...]:
         """Shape of the noisy quantity that `differentiate` flattens: (dim,), or (horizon, nu)."""
         if self.dim is None:
-            raise ValueError("dim is not known: call objective.sized_for(params) first")
+            raise ValueError("dim is not known: pass dim=... to parameter_noise, or call objective.sized_for(params)")
         return (self.dim,)
 
     def differentiate(self, params: Vector, noise: PyTree) -> Differentiated:
@@ -224,9 +224,7 @@ class ParameterNoise(Objective):
     dim: int | None = eqx.field(static=True)
 
     def sample_noise(self, key: PRNGKeyArray) -> Vector:
-        if self.dim is None:
-            raise ValueError("dim is not known: pass dim=... to parameter_noise")
-        return gaussian(key, self.stddev, (self.dim,))
+        return gaussian(key, self.stddev, self.noise_shape)
 
     def value(self, params: Vector, noise: Vector) -> Scalar:
         return as_scalar(self.function(params + noise.astype(params.dtype)), "function")
