@@ -85,7 +85,7 @@ def rollout(
     """
     arguments.check_start(scene, state)
     native = arguments.native_motion(scene, contact)
-    for message in smoothing_warnings(contact, scene.model) if isinstance(contact, Smoothing) else ():
+    for message in smoothing_warnings(scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
         raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')

@@ -76,8 +76,8 @@ class Smoothing(eqx.Module):
             raise ValueError(f"length must be positive and finite, got {np.asarray(self.length)!s}: {remedy}")
 
 
-def smoothing_warnings(smoothing: Smoothing, model: mjx.Model) -> list[str]:
-    """Return one sentence for each part of a model that is not smoothed; only its static structure is read."""
+def smoothing_warnings(model: mjx.Model) -> list[str]:
+    """Return one sentence for each part of a model that a smoothing does not affect; only its static structure is read."""
     messages = []
     pairs = contact_pairs(model)
     if not pairs:

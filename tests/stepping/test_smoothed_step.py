@@ -182,7 +182,7 @@ def test_what_has_no_force_at_a_distance_over_a_box_is_warned_of():
     pin, ball = eqx.filter_jit(mg.forward)(model, data, contact=smoothing).qacc
     assert abs(pin + 9.81) < 1e-12
     assert ball > -9.81 + 1
-    (warning,) = smoothing_warnings(smoothing, model)
+    (warning,) = smoothing_warnings(model)
     assert "pin – box" in warning
 
 
