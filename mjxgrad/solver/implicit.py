@@ -70,17 +70,16 @@ def solve_both(
     iterations is returned.
     """
     minimise = functools.partial(newton.minimise, layout, max_iterations)
+    of_batch = linear.batch_last(minimise)
 
     def second(system, differ, start, tolerance):
         none = jnp.zeros(differ.shape, jnp.int32)
         return linear.solve_subset(minimise, differ, (start, none), system, start, tolerance)
 
     if not device.is_cpu():  # a GPU solves all of them sooner than those that need it
-        both, counts = jax.vmap(lambda v: linear.batch_last(minimise)(system.with_variant(v), start, tolerance))(
-            variants
-        )
+        both, counts = jax.vmap(lambda v: of_batch(system.with_variant(v), start, tolerance))(variants)
         return both, jnp.max(counts)
-    found, count = linear.batch_last(minimise)(system.with_variant(variants[0]), start, tolerance)
+    found, count = of_batch(system.with_variant(variants[0]), start, tolerance)
     other, more = linear.batch_last(second)(system.with_variant(variants[1]), differ, found, tolerance)
     return jnp.stack([found, other]), jnp.maximum(count, more)
 

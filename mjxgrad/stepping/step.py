@@ -253,9 +253,8 @@ def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
     With M a the sum of all forces, (M + h D) a' = M a gives a' = a - (M + h D)⁻¹ h D a. So neither the forces nor their
     derivatives need to be summed.
     """
-    if model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER) or is_known_to_be(
-        0.0, model.dof_damping
-    ):
+    is_off = model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER)
+    if is_off or is_known_to_be(0.0, model.dof_damping):
         return data.qacc
     damping = model.opt.timestep * model.dof_damping
     return data.qacc - cholesky.solve_positive_definite(inertia_of(model, data).plus(damping), damping * data.qacc)
