@@ -40,12 +40,21 @@ def _states(xml: str, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(positions), np.array(speeds)
 
 
-def _covered(scene: mg.Scene, recording: identification.Recording) -> tuple[np.ndarray, identification.Identification]:
-    """Return whether the intervals of friction and mass hold, and the result."""
+def _assert_intervals_hold(xml: str, recordings: list[identification.Recording], may_stall: bool) -> None:
+    """Of 20 intervals that hold with 95 %, 17 or more do with a chance of 98 %; `pytest -s` shows the counts."""
+    scene, held, halves = mg.load_scene(xml, keep_everything=True), [], []
     parameters = {"friction": identification.friction(scene), "mass": identification.mass(scene, "box")}
-    result = mg.identify(scene, parameters, [recording])
-    error = np.array([result.values["friction"] - _FRICTION, result.values["mass"] - _MASS])
-    return np.abs(error) <= [result.half_width["friction"], result.half_width["mass"]], result
+    for recording in recordings:
+        result = mg.identify(scene, parameters, [recording])
+        error = np.array([result.values["friction"] - _FRICTION, result.values["mass"] - _MASS])
+        halves.append([result.half_width["friction"], result.half_width["mass"]])
+        held.append(np.abs(error) <= halves[-1])
+        assert result.is_sound or may_stall, result.summary()
+    share = np.median(halves, axis=0) / (_FRICTION, _MASS)
+    print(
+        f"\nfriction and mass hold {np.sum(held, axis=0)} of {len(held)}, median half widths {np.round(100 * share, 2)} %"
+    )
+    assert (np.sum(held, axis=0) >= 17).all()
 
 
 @pytest.mark.slow
@@ -62,39 +71,29 @@ def _covered(scene: mg.Scene, recording: identification.Recording) -> tuple[np.n
     ],
 )
 def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn, is_exact):
-    """Of 20 intervals that hold with 95 %, 17 or more do with a chance of 98 %, whether starts are given or measured.
+    """Whether starts are given or measured. A box that turns chatters corner by corner.
 
-    A box that turns chatters corner by corner: friction that is 0.2 % off has other motions after twenty steps.
+    Friction that is 0.2 % off has other motions after twenty steps. Chatter that is not normal may stall the search.
     """
-    xml = _BOX.format(contact, turn)
-    scene, (_, true) = mg.load_scene(xml, keep_everything=True), _states(xml, _CONTROLS)
-    covered = np.zeros(2, int)
+    xml, recordings = _BOX.format(contact, turn), []
+    start = mg.initial_state(mg.load_scene(xml, keep_everything=True)) if is_exact else None
+    true = _states(xml, _CONTROLS)[1]
     for seed in range(20):
         measured = true + _NOISE * np.random.default_rng(seed).normal(size=true.shape)
-        start = mg.initial_state(scene) if is_exact else None
-        recording = identification.Recording({"qvel": measured}, _CONTROLS, noise={"qvel": _NOISE}, start=start)
-        holds, result = _covered(scene, recording)
-        covered += holds
-        assert result.is_sound or (turn and not is_exact), result.summary()  # chatter that is not normal may stall it
-        assert result.num_motions == 1 or contact != _SOFT
-    assert (covered >= 17).all(), covered
+        recordings.append(identification.Recording({"qvel": measured}, _CONTROLS, noise={"qvel": _NOISE}, start=start))
+    _assert_intervals_hold(xml, recordings, may_stall=bool(turn) and not is_exact)
 
 
 @pytest.mark.slow
-def test_intervals_hold_where_a_height_of_a_millimetre_decides_all_that_follows():
-    """Ten recordings of places to 1 mm, soft contact: 0.3 mm of height change the sum of squares eightfold.
-
-    By one descent none is found. Of 20 intervals that hold with 95 %, 17 or more do with a chance of 98 %.
-    """
-    xml, count = _FREE.format(_SOFT), 0
-    scene = mg.load_scene(xml, keep_everything=True)
-    for seed in range(10):
+@pytest.mark.parametrize("contact", [_SOFT, ""], ids=["soft contact", "default contact"])
+def test_intervals_hold_where_a_height_of_a_millimetre_decides_all_that_follows(contact):
+    """A free box, places to 1 mm: on soft contact 0.3 mm of height change the sum of squares eightfold."""
+    xml, recordings = _FREE.format(contact), []
+    for seed in range(20):
         t = 0.002 * np.arange(500 + 250 * (seed % 2))
         controls = np.stack([14 * np.sin(9 * t + seed), 11 * np.sin(6.5 * t + 1)], axis=1)
-        measured = np.full((len(t) + 1, 7), np.nan)
         places = _states(xml, controls)[0][:, :3]
+        measured = np.full((len(t) + 1, 7), np.nan)
         measured[:, :3] = places + 0.001 * np.random.default_rng(100 + seed).normal(size=places.shape)
-        holds, result = _covered(scene, identification.Recording({"qpos": measured}, controls, noise={"qpos": 0.001}))
-        assert result.is_sound, result.summary()
-        count += holds.sum()
-    assert count >= 17
+        recordings.append(identification.Recording({"qpos": measured}, controls, noise={"qpos": 0.001}))
+    _assert_intervals_hold(xml, recordings, may_stall=not contact)
