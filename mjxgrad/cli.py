@@ -130,6 +130,7 @@ def check(
     cost: str | None = None,
     html: Path | None = None,
     quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
+    mjx: Annotated[bool, cyclopts.Parameter(negative="")] = False,
     budget: float = 12.0,
     seed: Whole = 0,
 ) -> int:
@@ -140,12 +141,13 @@ def check(
         cost: file.py:function or module:function, from a trajectory to its cost; or height:body and others, see `sweep`.
         html: write a page to this file.
         quick: only fast checks, in seconds: contact, time step, parts without effect, one value and derivative of the cost.
+        mjx: compare a step by MJX with C MuJoCo's, too, which takes up to a minute to compile.
         budget: duration in s once the scene is loaded; the report names measurements that are left out.
         seed: seed of all random numbers.
     """
     _writable(html, is_page=True)
     mg, log = _library(), _timed()
-    verdict = mg.check(_existing(scene), cost, derivatives=not quick, budget=budget, seed=seed, log=log)
+    verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)
     if html is not None:
         write(html, verdict.as_html())

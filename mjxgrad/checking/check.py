@@ -107,6 +107,7 @@ def check(
     cost: str | Cost | None = None,
     *,
     derivatives: bool = True,
+    mjx: bool = False,
     budget: int | float = 12.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
@@ -122,6 +123,7 @@ def check(
         cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it, or its name as in `sweep`;
             motions are then simulated from their start. None uses random mixes of final positions and velocities.
         derivatives: whether to measure derivatives; False looks at motions alone, and calls a cost once.
+        mjx: whether to compare a step by MJX with C MuJoCo's, too; it takes up to a minute to compile.
         budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
             measurements that are left out.
         seed: seed of all random numbers.
@@ -135,6 +137,7 @@ def check(
         SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
     instance("derivatives", derivatives, bool, "True or False")
+    instance("mjx", mjx, bool, "True or False")
     if not real("budget", budget) > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
     function("log", log, "text")
@@ -164,6 +167,9 @@ def check(
             )
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
+    if mjx and (motions.bad_steps < 0).any():
+        say("compiling a step by MJX")
+        found.append(findings.engine_finding(scene, motions))
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None

@@ -1,11 +1,14 @@
 """Interpretation of the measurements: named faults, findings and recommended settings, with the names of the scene."""
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
@@ -13,13 +16,16 @@ from mjxgrad.batched import device
 from mjxgrad.checking.measure import STDDEVS, Measured
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
+from mjxgrad.rollouts import rollout
 from mjxgrad.rollouts.state import LARGEST_GROWTH
 from mjxgrad.scene import Scene
+from mjxgrad.stepping import own_motion
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
-    "cost", "not_measured", "left_out", "slope", "order", "note",
+    "cost", "engines", "not_measured", "left_out", "slope", "order", "note",
 ]  # fmt: skip
+_NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
@@ -126,6 +132,28 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
     return Finding(
         "cost", f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}", is_useless
     )
+
+
+def engine_finding(scene: Scene, motions: Motions) -> Finding:
+    """Compare a step by MJX, which is compiled, with C MuJoCo's, both solved to rounding, in states of the motions."""
+    if scene.unsupported:
+        return Finding("engines", f"MJX does not step this scene: {scene.unsupported}.")
+    rng, whole = np.random.default_rng(0), np.flatnonzero(motions.bad_steps < 0)
+    at = rng.choice(whole, _NUM_COMPARED), rng.integers(motions.controls.shape[1], size=_NUM_COMPARED)
+    states, ends = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *at)), []
+    scene = eqx.tree_at(lambda s: s.model.opt.tolerance, scene, jnp.full_like(scene.model.opt.tolerance, 1e-14))
+    for engine in ("mjx", "mujoco"):
+        run = functools.partial(rollout, scene, contact=own_motion("discrete", engine))
+        found = jax.jit(jax.vmap(lambda state, control, run=run: run(state, control[None]).qvel[-1]))
+        ends.append(np.asarray(found(states, motions.controls[at])))
+    off = np.abs(ends[0] - ends[1]) / np.maximum(np.abs(ends[1]).max(axis=1, keepdims=True), 1)
+    place, dof = np.unravel_index(off.argmax(), off.shape)
+    text = f"A step by MJX is C MuJoCo's to {off.max():.1g} of the speeds, in {_NUM_COMPARED} states"
+    if off.max() < (_ALIKE if off.dtype == np.float64 else np.sqrt(_ALIKE)):
+        return Finding("engines", f"{text}.")
+    joint = scene.mj_model.joint(scene.mj_model.dof_jntid[dof]).name or f"joint {scene.mj_model.dof_jntid[dof]}"
+    when = f"{motions.poses[at[0][place]]}, {at[1][place] * motions.timestep:.3g} s on"
+    return Finding("engines", f"{text}, worst at {joint} ({when}). C MuJoCo's own step is by engine mujoco.", True)
 
 
 def measured_findings(measured: Measured) -> Iterator[Finding]:
@@ -304,6 +332,7 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
         "cost": "the cost has no derivative",
+        "engines": "MJX moves it otherwise",
         "no_contact": "nothing touches",
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",
