@@ -1,7 +1,7 @@
 """Contacts of planes, balls and capsules; a ball is a capsule of length zero.
 
 All pairs with a plane share one formula, and all others another: forty pairs of a robot take as many operations as one.
-Distances, positions and normals agree with C MuJoCo. Tangents agree with MJX, but are normal to tilted planes, too.
+All agree with C MuJoCo. MJX has other tangents for capsules that lean by more than 60° from a plane, such as standing legs.
 
 Nearest points of two segments, with unit axes a₁ and a₂ and centres r apart: the first line is nearest to the second at
 s = (a₂·r a₁·a₂ - a₁·r) / (1 - (a₁·a₂)²), and t = a₂·r + s a₁·a₂ is the point of the second line nearest to s. s is clamped
@@ -32,8 +32,9 @@ _Group = Int[np.ndarray, "_ 2"]
 Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]]
 """Distances, positions and frames."""
 _PLANE, _SPHERE, _CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE"))
-# Square of the cosine beyond which the axis of a capsule is too steep to give contacts on a plane their tangent.
-_STEEP = 0.75
+# Tilt of an upright axis over rounding, which gives no tangent; square of one over a root of rounding, below small differences:
+# there the tangent turns so fast that its derivative means nothing.
+_UPRIGHT, _NEARLY = 16.0, 0.01
 
 
 def has_formula(key: Any) -> bool:
@@ -65,8 +66,12 @@ def _on_planes(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[
     along, lean = jnp.asarray(end, half.dtype) * half, dot(normal, axis)
     dist = dot(normal, centre - origin) + along * lean - radius
     pos = centre + scale(along, axis) - scale(radius + 0.5 * dist, normal)
-    lies_along = (end != 0) & (lean * lean <= _STEEP)
-    return (dist, pos, _frames(normal, jnp.where(lies_along[:, None], axis, _sideways(normal)))), counts
+    tilt, rounding = axis - scale(lean, normal), float(jnp.finfo(axis.dtype).eps)
+    square = dot(tilt, tilt)[:, None]
+    axis = jnp.where(square < _NEARLY * rounding**0.5, jax.lax.stop_gradient(axis), axis)
+    x = jnp.where(jnp.abs(normal[:, :1]) < 0.5, jnp.array([1.0, 0.0, 0.0], axis.dtype), _sideways(normal))
+    along = jnp.where(square < (_UPRIGHT * rounding) ** 2, x, axis)
+    return (dist, pos, _frames(normal, jnp.where((end != 0)[:, None], along, _sideways(normal)))), counts
 
 
 def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Found, list[int]]:
