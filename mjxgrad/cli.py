@@ -236,7 +236,7 @@ def identify(
         held_out: share for validation only: every n-th recording, or the end of a single one.
         start: as the first row says, as noisy as that, and what it lacks is the scene's pose, at rest; exactly this pose, at
             rest; or all unknown, to be found, too.
-        max_steps: largest number of simulations with derivatives.
+        max_steps: largest number of simulations with derivatives; those of many motions without are not counted.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)

@@ -164,16 +164,16 @@ class Identification(Printed):
     def warnings(self) -> list[str]:
         """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""
         found = []
-        if self.stopped is Stopped.STALLED:
-            found.append(
-                "Stalled: the mean of many motions does not settle. Give narrower bounds, shorter windows or softer contact."
-            )
         if self.has_noise and self._is_unexplained:
-            free = "" if self.offsets is not None or self.num_motions > 1 else "free_start=True, "
+            free = "" if self.offsets is not None or self.num_motions > 1 else "free_start=True (--start free), "
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
                 f"other first values, {free}shorter windows (recording.cut) or more parameters, or correct the noise."
+            )
+        if self.stopped is Stopped.STALLED:
+            found.append(
+                "Stalled: the mean of many motions does not settle. Give narrower bounds, shorter windows or softer contact."
             )
         if self.has_noise and self.rms[1] < _OVERSTATED and self.num_numbers >= _ENOUGH:
             found.append(
@@ -186,7 +186,11 @@ class Identification(Printed):
                 "most where contacts chatter."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
-            starts = "" if self.offsets is not None else "The starts may be noisy: free_start=True finds them, too. "
+            starts = (
+                ""
+                if self.offsets is not None
+                else "The starts may be noisy: free_start=True (--start free) finds them. "
+            )
             found.append(
                 f"Residuals follow one another (correlation {self.correlation:.2f} from one time to the next), so something is "
                 f"not as in the scene. {starts}Values may be off by more than their intervals, which assume independent noise."

@@ -70,7 +70,7 @@ def identify(
         contact: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need, for the intervals do not cover the
             error of another one. It is by MJX, but in single precision by C MuJoCo where joints alone were measured, since
             chattering contacts need double precision. `mg.Onset()` is a smoother motion, for recordings of real things.
-        max_steps: largest number of simulations with derivatives.
+        max_steps: largest number of simulations with derivatives; those of many motions without are not counted.
         log: called after each step, or ensemble of motions, as `log(step, {"rms": ..., "is_accepted": ...})`.
 
     Returns:
@@ -114,10 +114,10 @@ def identify(
             rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
             residual, slope, _ = _without_offsets(*on_host(end.found))
             told = _told(residual, slope * np.asarray(program.coordinates.scale), np.finfo(float).tiny)
-            if told > _told(many.residual, many.slope, many.noise**2) and not _is_off(program, end, many.noise):
+            if _is_off(program, end, many.noise):
+                many = None if not is_rugged and _rms(program, end.found) < _BETTER * rms else many
+            elif told > _told(many.residual, many.slope, many.noise**2):
                 many, end = None, end._replace(stopped=Stopped.CONVERGED)
-            elif not is_rugged and _rms(program, end.found) < _BETTER * rms:
-                many = None
     except KeyboardInterrupt:
         end = end._replace(stopped=Stopped.INTERRUPTED)
     except DivergedError:  # most motions between the bounds
@@ -161,7 +161,7 @@ def _alone(
     values = np.stack([np.asarray(program.coordinates.values(one.point[:count]), float) for one in ends])
     weights = scipy.special.softmax([-total(one) / 2 for one in ends])
     away = values - values[0]
-    return ends[0]._replace(first=end.first, away=np.einsum("k,ki,kj->ij", weights, away, away))
+    return ends[0]._replace(first=end.first, stopped=end.stopped, away=np.einsum("k,ki,kj->ij", weights, away, away))
 
 
 def _told(residual: np.ndarray, slope: np.ndarray, least: float) -> float:

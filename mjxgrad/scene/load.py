@@ -21,6 +21,7 @@ from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
+from mjxgrad.contact.warnings import contact_differences
 from mjxgrad.scene.conversions import (
     AFTER_REFUSALS,
     BEFORE_REFUSALS,
@@ -103,6 +104,7 @@ def load_scene(
     head, *more = unsupported.splitlines() or [""]
     reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [head])
     messages += [f"C MuJoCo steps it: {reasons}; see scene.unsupported"] if unsupported and engine is None else []
+    messages += contact_differences(mj_model, pairs, only_often=True) if not unsupported else []
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))

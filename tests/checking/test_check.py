@@ -108,6 +108,26 @@ def test_the_first_touch_is_that_of_free_fall():
     np.testing.assert_allclose(touch.speed, np.sqrt(2 * 9.81 * 0.25), rtol=0.02)
 
 
+def test_a_step_by_mjx_is_compared_with_c_mujocos_where_that_is_asked():
+    """A ball meets a floor by one formula; a capsule meets a box by rules of MJX's own, of which the load warns, too."""
+    alike = mg.check(ball(), derivatives=False, mjx=True)
+    assert "A step by MJX is C MuJoCo's to " in alike.summary()
+    assert "engines" not in kinds(alike)
+    other = mg.check(
+        """<mujoco><worldbody><geom type="box" size=".2 .2 .1"/><body name="rod" pos=".18 .18 .3" euler="20 60 0">
+        <freejoint name="root"/><geom type="capsule" size=".03 .1"/></body></worldbody></mujoco>""",
+        derivatives=False,
+        mjx=True,
+    )
+    assert "worst at root (the reference pose" in fault(other, "engines")
+    assert other.headline.startswith("Mind that MJX moves it otherwise")
+    assert "Capsule with box: MJX has rules of its own" in other.summary()
+    lacking = mg.check(
+        ball().replace('<geom name="ball"', '<geom type="ellipsoid" name="ball"'), derivatives=False, mjx=True
+    )
+    assert "engines" not in kinds(lacking)
+
+
 def test_pairs_are_counted_as_they_are_listed():
     """By contype and conaffinity; geoms of one body never touch."""
     geoms = "<geom size='.1'/><geom size='.1' contype='2' conaffinity='4'/>"
