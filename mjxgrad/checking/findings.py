@@ -137,7 +137,7 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
 def engine_finding(scene: Scene, motions: Motions) -> Finding:
     """Compare a step by MJX, which is compiled, with C MuJoCo's, both solved to rounding, in states of the motions."""
     if scene.unsupported:
-        return Finding("engines", f"MJX does not step this scene: {scene.unsupported}.")
+        return Finding("engines", f"{scene.unsupported}.")
     rng, whole = np.random.default_rng(0), np.flatnonzero(motions.bad_steps < 0)
     at = rng.choice(whole, _NUM_COMPARED), rng.integers(motions.controls.shape[1], size=_NUM_COMPARED)
     states, ends = (
