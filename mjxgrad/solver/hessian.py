@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjxgrad.batched import cholesky, device, linear, on_gpu
 from mjxgrad.solver.constraint import RowHessian, RowLayout
-from mjxgrad.solver.jacobian import DenseRows, Group, RowMap, dense, edges, flat, fold
+from mjxgrad.solver.jacobian import Group, RowMap, as_rows, dense, edges, flat, fold
 
 _Vector = Float[Array, "nv *batch"]
 _Matrix = Float[Array, "nv nv *batch"]
@@ -40,9 +40,8 @@ class SparseRows(eqx.Module):
     def of(cls, rows: RowMap, is_active: Bool[Array, "rows *batch"], num_dofs: int) -> "SparseRows":
         """Return the entries of a map; inactive rows are zero."""
         if not _keeps_groups(rows):
-            rows = DenseRows(
-                rows.matrix(num_dofs), tuple((g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid)
-            )
+            cones = [(g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid]
+            rows = as_rows(rows.matrix(num_dofs), cones)
         pieces, start = [], 0
         for group, entries in zip(rows.groups, rows.directions(), strict=True):
             active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])

@@ -74,37 +74,10 @@ class RowMap(eqx.Module):
 
 
 class DenseRows(RowMap):
-    """Rows with all entries of J; `cones` has number and dimension of the elliptic contacts, which come last."""
+    """Single rows, or contacts of one dimension (items), with all entries of J; `friction` has μ of a pyramid's tangents."""
 
-    entries: Float[Array, "rows nv *batch"]
-    cones: tuple[tuple[int, int], ...] = eqx.field(static=True, default=())
-
-    @property
-    def groups(self) -> tuple[Group, ...]:
-        dofs, coupled = tuple(range(self.entries.shape[1])), sum(num * dim for num, dim in self.cones)
-        single = len(self.entries) - coupled
-        return (*([Group(dofs, single)] if single else []), *(Group(dofs, *cone) for cone in self.cones))
-
-    def mv(self, velocity):
-        return contract("rv,v->r", self.entries, velocity)
-
-    def rmv(self, force):
-        return contract("rv,r->v", self.entries, force)
-
-    def directions(self):
-        pieces, start = [], 0
-        for group in self.groups:
-            rows = self.entries[start : start + group.num_rows]
-            pieces.append(rows.reshape(group.num, group.dim, *rows.shape[1:]))
-            start += group.num_rows
-        return pieces
-
-
-class SlotRows(RowMap):
-    """Rows of contacts of one dimension whose bodies are known only at run time; `friction` has μ of a pyramid's tangents."""
-
-    entries: Float[Array, "contacts dim nv *batch"]
-    friction: Float[Array, "contacts tangents *batch"] | None
+    entries: Float[Array, "items dim nv *batch"]
+    friction: Float[Array, "items tangents *batch"] | None = None
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -112,10 +85,10 @@ class SlotRows(RowMap):
         return (Group(tuple(range(num_dofs)), count, dim, is_pyramid=self.friction is not None),)
 
     def mv(self, velocity):
-        return edges(contract("cdv,v->cd", self.entries, velocity), self.friction).reshape(-1)
+        return edges(contract("idv,v->id", self.entries, velocity), self.friction).reshape(-1)
 
     def rmv(self, force):
-        return contract("cdv,cd->v", self.entries, fold(force.reshape(len(self.entries), -1), self.friction))
+        return contract("idv,id->v", self.entries, fold(force.reshape(len(self.entries), -1), self.friction))
 
     def directions(self):
         return [self.entries]
@@ -288,6 +261,14 @@ class JoinedRows(RowMap):
 
     def friction_by_group(self):
         return [mu for part in self.parts for mu in part.friction_by_group()]
+
+
+def as_rows(matrix: Float[Array, "rows nv *batch"], cones: Sequence[tuple[int, int]]) -> JoinedRows:
+    """Return J as a map; `cones` has number and dimension of the elliptic contacts, which come last."""
+    items = ((len(matrix) - sum(num * dim for num, dim in cones), 1), *cones)
+    pieces = jnp.split(matrix, np.cumsum([num * dim for num, dim in items])[:-1])
+    pairs = zip(pieces, items, strict=True)
+    return JoinedRows(tuple(DenseRows(x.reshape(*size, *x.shape[1:])) for x, size in pairs if len(x)))
 
 
 def dense(

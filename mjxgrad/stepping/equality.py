@@ -52,7 +52,7 @@ def _block(
     flat = residual.reshape(-1)
     zero = jnp.zeros_like(flat)
     return Block(
-        map=DenseRows(jacobian.reshape(flat.size, -1)),
+        map=DenseRows(jacobian.reshape(flat.size, 1, -1)),
         residual=flat,
         impedance=jax.tree.map(spread, impedance(model.eq_solimp[ids], safe_norm(residual))),
         solimp=spread(model.eq_solimp[ids]),

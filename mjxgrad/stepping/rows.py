@@ -23,7 +23,7 @@ from mjxgrad.batched.maps import safe_norm
 from mjxgrad.bodies import spatial, tree
 from mjxgrad.contact.collision import slot_geoms
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
-from mjxgrad.solver.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, SlotRows, fold
+from mjxgrad.solver.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, fold
 
 _PerRow = Float[Array, " rows"]
 
@@ -142,7 +142,7 @@ def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int
     friction = contact.friction[:, : dim - 1] if has_pyramids(model, dim) else None
     bodies = _bodies(model, data, contact, first)
     if not isinstance(bodies, np.ndarray):
-        return SlotRows(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
+        return DenseRows(contact_jacobian(model, data, contact.pos, contact.frame, bodies, dim), friction)
     moves = tree.moving_dofs(model)
     shares_root = model.body_rootid[bodies[:, 0]] == model.body_rootid[bodies[:, 1]]
     own = moves[bodies]
@@ -261,7 +261,7 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
     if dofs.size:
         parts.append(_axis_rows(jnp.ones(dofs.size, dtype), dofs, model))
     if tendons.size:
-        parts.append(DenseRows(data._impl.ten_J[tendons]))
+        parts.append(DenseRows(data._impl.ten_J[tendons][:, None]))
     zero = jnp.zeros(count, dtype)
 
     def join(of_dofs: Any, of_tendons: Any) -> Array:
@@ -302,7 +302,7 @@ def limits(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
         blocks[1] = one_sided(_axis_rows(sign, dofs, model), distance, model.dof_invweight0[dofs], joints, *of_joints)
     if tendons.size:
         distance, sign = _nearer_end(data.ten_length[tendons], model.tendon_range[tendons])
-        rows = DenseRows(sign[:, None] * data._impl.ten_J[tendons])
+        rows = DenseRows((sign[:, None] * data._impl.ten_J[tendons])[:, None])
         blocks[2] = one_sided(rows, distance, model.tendon_invweight0[tendons], tendons, *of_tendons)
     return blocks
 
@@ -336,7 +336,7 @@ def _ball_limit(model: mjx.Model, data: mjx.Data, joints: np.ndarray) -> tuple[R
     axis = turn / jnp.where(angle > 1e-12, angle, 1.0)[:, None]
     select = np.zeros((len(joints), 3, model.nv))
     select[np.arange(len(joints))[:, None], np.arange(3), model.jnt_dofadr[joints][:, None] + np.arange(3)] = 1
-    rows = DenseRows(-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1))
+    rows = DenseRows(-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1, keepdims=True))
     return rows, jnp.max(model.jnt_range[joints], axis=1) - angle
 
 

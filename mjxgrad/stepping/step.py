@@ -24,7 +24,7 @@ from mjxgrad.bodies.kinematics import Inertia, inertia_of, integrate_position
 from mjxgrad.contact.collision import collide
 from mjxgrad.solver import implicit
 from mjxgrad.solver.constraint import RowLayout, Rows
-from mjxgrad.solver.jacobian import DenseRows, JoinedRows
+from mjxgrad.solver.jacobian import as_rows
 from mjxgrad.solver.newton import System, Variant
 from mjxgrad.stepping import assembly, onset
 from mjxgrad.stepping.contact import Contact, Discrete, Onset, Slope, Smoothing, check_contact
@@ -161,7 +161,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     with _at_full_precision(model, data):
         layout, impl = assembly.row_layout(model, data), data._impl
         rows = Rows(impl.efc_aref, impl.efc_D, impl.efc_frictionloss, assembly.cone_scales(model, data, layout))
-        entries = JoinedRows((DenseRows(impl.efc_J, tuple((cone.count, cone.dim) for cone in layout.cones)),))
+        entries = as_rows(impl.efc_J, [(cone.count, cone.dim) for cone in layout.cones])
         active = jnp.ones(layout.num_rows, bool)
         system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
         if not layout.num_rows or not model.nv:

@@ -80,7 +80,7 @@ def _problem(size, bad=None):
     rows = Rows(_last(reference), _last(weight), _last(bound), ())
     sign = jacobian[:, 0]
     axes = (AxisRows(sign[2:5], (1, 2, size - 1), size), AxisRows(sign[5:10], tuple(range(1, 6)), size))
-    entries = JoinedRows((DenseRows(jacobian[:2]), *axes, DenseRows(jacobian[10:])))
+    entries = JoinedRows((DenseRows(jacobian[:2, None]), *axes, DenseRows(jacobian[10:, None])))
     return layout, System(Inertia(_last(mass)), _last(force), entries, _last(active), rows)
 
 

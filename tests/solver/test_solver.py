@@ -110,7 +110,7 @@ def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
     single = [jnp.asarray(x, jnp.float32) for x in (np.diag(mass), force, np.eye(2), reference, weight)]
     inertia, force, entries, reference, weight = single
     rows = Rows(reference, weight, jnp.zeros_like(weight), ())
-    system = System(Inertia(inertia), force, JoinedRows((DenseRows(entries),)), jnp.ones(2, bool), rows)
+    system = System(Inertia(inertia), force, JoinedRows((DenseRows(entries[:, None]),)), jnp.ones(2, bool), rows)
     start = jnp.array([expected[0], 0.0], jnp.float32)
     tolerance = jnp.asarray(1e-6, jnp.float32)
     found, _ = newton.minimise(RowLayout(0, 0, 2), 100, system, start, tolerance)
@@ -200,7 +200,7 @@ def test_in_single_precision_it_ends_when_what_is_left_is_rounding():
     layout, found = RowLayout(0, 0, 4), {}
     for dtype in (jnp.float32, jnp.float64):
         rows = Rows(*(jnp.asarray(x, dtype) for x in (reference, weight, 0 * weight)), ())
-        entries = JoinedRows((DenseRows(jnp.asarray(jacobian, dtype)),))
+        entries = JoinedRows((DenseRows(jnp.asarray(jacobian, dtype)[:, None]),))
         system = System(
             Inertia(jnp.asarray(mass, dtype)), jnp.asarray(force, dtype), entries, jnp.ones((4, batch), bool), rows
         )
@@ -224,7 +224,7 @@ def test_a_row_so_stiff_that_rounding_hides_the_mass_leaves_a_finite_response(si
 
     def response(row, force, weight):
         rows = Rows(jnp.zeros_like(weight), weight, jnp.zeros_like(weight), ())
-        entries = JoinedRows((DenseRows(row),))
+        entries = JoinedRows((DenseRows(row[:, None]),))
         system = System(Inertia(jnp.eye(size, dtype=force.dtype)), force, entries, jnp.ones(1, bool), rows)
         return implicit.solve_linearised(RowLayout(0, 0, 1), system, constraint.RowHessian(weight, ()), force)
 
