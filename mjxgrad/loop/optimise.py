@@ -106,8 +106,7 @@ class GradientStep(Descent):
         return jax.tree.map(jnp.asarray, self.optimiser.init(params))
 
     def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
-        scale, objective = self.annealed(self.objective, carry.params, index)
-        estimate = _checked(self.estimator(objective, carry.params, jax.random.fold_in(carry.key, index)))
+        scale, estimate = self.estimated(self.objective, carry.params, carry.key, index)
         change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
         dtype = carry.params.dtype
         record = Record(
@@ -125,14 +124,18 @@ class GradientStep(Descent):
         )
         return self.moved(carry, index, carry.params + change, state, record)
 
-    def annealed(
-        self, objective: Objective | AnnealedObjective, params: Vector, step: Int[Array, ""]
-    ) -> tuple[Scalar, Objective]:
-        """Return the scale of a step, 1 without annealing, and the objective at this scale."""
-        if self.annealing is None:
-            return jnp.ones((), params.dtype), as_objective(objective)
-        scale = jnp.asarray(self.annealing(step), params.dtype)
-        return scale, objective(scale)  # pyright: ignore[reportCallIssue]
+    def estimated(
+        self, objective: Any, params: Vector, key: PRNGKeyArray, step: Int[Array, ""]
+    ) -> tuple[Scalar, GradientEstimate]:
+        """Return the scale of a step, 1 without annealing, and the estimate at this scale."""
+        scale = jnp.ones((), params.dtype)
+        if self.annealing is not None:
+            scale = jnp.asarray(self.annealing(step), params.dtype)
+            objective = objective(scale)
+        estimate = self.estimator(objective, params, jax.random.fold_in(key, step))
+        if not isinstance(estimate, GradientEstimate):
+            raise ValueError(f"estimator must return a GradientEstimate, got {type(estimate).__name__}")
+        return scale, jax.tree.map(jnp.asarray, estimate)
 
     def change(
         self, params: Vector, state: PyTree, estimate: GradientEstimate, gradient: Vector
@@ -201,9 +204,7 @@ def estimated_gradient(
 
     def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Scalar, GradientEstimate]:
         vector, restore = flattened(params)
-        scale, annealed = rule.annealed(of_vector(objective, restore), vector, step)
-        estimate = _checked(estimator(annealed, vector, jax.random.fold_in(key, step)))
-        return scale, jax.tree.map(jnp.asarray, estimate)
+        return rule.estimated(of_vector(objective, restore), vector, key, step)
 
     def init(params: PyTree) -> EstimatedGradientState:
         zero = jnp.zeros((), jnp.int32)
@@ -225,10 +226,3 @@ def estimated_gradient(
         return change if restore is None else eqx.filter(restore(change), eqx.is_inexact_array), moved
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]
-
-
-def _checked(estimate: Any) -> GradientEstimate:
-    """Return an estimate, or say what an estimator of one's own must return."""
-    if not isinstance(estimate, GradientEstimate):
-        raise ValueError(f"estimator must return a GradientEstimate, got {type(estimate).__name__}")
-    return estimate
