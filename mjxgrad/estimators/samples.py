@@ -17,7 +17,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import one_key, whole
-from mjxgrad.estimators.moments import merged
+from mjxgrad.estimators.moments import Moments, merged
 from mjxgrad.objective import Differentiated, Objective
 from mjxgrad.objective.base import Scalar, Vector, unchanged, value_and_gradient
 
@@ -203,19 +203,17 @@ class Group(eqx.Module):
         raw, gradients = flat.cost, flat.gradient_by_noise
         has_cost = jnp.repeat(samples.is_noisy, per_unit) & jnp.isfinite(raw)
         has_derivative = has_cost & jnp.isfinite(gradients).all(axis=1)
-        costs = jnp.where(has_cost, raw, 0)
         # Taken about one of the costs first: a mean of large costs is too inexact to subtract.
-        origin = costs[jnp.argmax(has_cost)]
-        offset = jnp.where(has_cost, costs - origin, 0).sum() / jnp.maximum(has_cost.sum(), 1).astype(costs.dtype)
+        found = Moments.of(raw, has_cost)
         return cls(
-            costs=jnp.where(has_cost, (costs - origin) - offset, 0),
+            costs=jnp.where(has_cost, (raw - found.origin) - found.offset, 0),
             derivatives=jnp.where(has_derivative[:, None], gradients, 0),
             scores=flat.noise_score,
             has_cost=has_cost,
             has_derivative=has_derivative,
             stddev=flat.noise_stddev[0],
-            centre=origin + offset,
-            rounding=jnp.abs(costs).max(),
+            centre=found.mean,
+            rounding=jnp.abs(jnp.where(has_cost, raw, 0)).max(),
             per_unit=per_unit,
         )
 
