@@ -129,7 +129,8 @@ class System:
     def problem(self, layout: RowLayout) -> "Problem":
         """Return the problem with the entries of M and J; arrays may carry the batch as trailing axes."""
         jacobian = SparseRows.of(self.map, self.is_active, len(self.force))
-        return Problem(self.force, self.rows, self.inertia.matrix, jacobian, layout)
+        diagonal = jnp.maximum(linear.diagonal(self.inertia.matrix), mujoco.mjMINVAL)
+        return Problem(self.force, self.rows, self.inertia.matrix, diagonal, jacobian, layout)
 
 
 class Problem(eqx.Module):
@@ -141,6 +142,7 @@ class Problem(eqx.Module):
     force: _Vector
     rows: Any  # `Rows`
     mass: Float[Array, "nv nv *batch"]
+    diagonal: _Vector  # of M, positive
     jacobian: Any  # `SparseRows`
     layout: RowLayout = eqx.field(static=True)
 
@@ -168,11 +170,6 @@ class Problem(eqx.Module):
         """Return H⁻¹ times the gradient, not finite where H is not positive definite, and the diagonal of H."""
         row_hessian = constraint.hessian(self.layout, self.rows, point.x)
         return hessian.solve(self.mass, self.jacobian, self.layout, row_hessian, point.gradient)
-
-    @property
-    def diagonal(self) -> _Vector:
-        """The diagonal of M, positive."""
-        return jnp.maximum(linear.diagonal(self.mass), mujoco.mjMINVAL)
 
     def is_finite(self, vector: _Vector) -> _Truth:
         """Return whether all entries of a vector are finite."""
@@ -229,7 +226,6 @@ class _KernelProblem(Problem):
     """
 
     signs: tuple[Float[Array, " width"], ...]  # entries of the rows that act on one joint velocity
-    on_diagonal: _Vector
     refs: tuple[Any, Any]  # M and J in memory
     size: int = eqx.field(static=True)
 
@@ -271,10 +267,6 @@ class _KernelProblem(Problem):
             own = linear.add(sign**2 * other for sign, other in zip(self.signs, others, strict=True))
             matrix = on_gpu.add_to_diagonal(matrix, own)
         return on_gpu.solve_blocks(matrix, point.gradient, self.size), on_gpu.diagonal(matrix)
-
-    @property
-    def diagonal(self):
-        return self.on_diagonal
 
     def is_finite(self, vector):
         return on_gpu.is_finite(vector)
@@ -345,7 +337,7 @@ def in_one_kernel(
     def kernel(mass, jacobian, force, diagonal, start, smallest, *refs):
         *refs, acceleration, num_iterations = refs
         rows, signs = jax.tree.unflatten(structure, [ref[...] for ref in refs])
-        parts = (force[...], rows, mass[...], jacobian[...], layout, signs, diagonal[...])
+        parts = (force[...], rows, mass[...], diagonal[...], jacobian[...], layout, signs)
         problem = _KernelProblem(*parts, (mass, jacobian), size)
         solver = _Solver(problem, smallest[...], max_iterations)
         first = solver.measure(start[...], jnp.array(False), jnp.int32(0))
