@@ -175,18 +175,15 @@ def begin(
     """
     if not any(block.rows_each for block in blocks):
         return blocks, None
-    found, sides, rows, num_contacts = [], [], [], 0
+    found, sides, rows = [], [], []
     for block in blocks:
         if not block.rows_each:
             rows.append(block)
             found.append(jnp.ones_like(block.residual))
             sides.append(None)
             continue
-        each, count = block.rows_each, len(block.residual) // block.rows_each
-        geoms = slice(num_contacts, num_contacts + count) if block.is_contact else None
-        num_contacts += count if block.is_contact else 0
-        share, side = _share(model, data, block, how, geoms)
-        share = jnp.repeat(share, each)
+        share, side = _share(model, data, block, how)
+        share = jnp.repeat(share, block.rows_each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
         rows.append(dataclasses.replace(block, is_active=share > 0, impedance=impedance))
@@ -221,9 +218,7 @@ class _Side(eqx.Module):
     map: RowMap
 
 
-def _share(
-    model: mjx.Model, data: mjx.Data, block: Block, how: Onset | _Vector, contacts: slice | None
-) -> tuple[_PerContact, _Side | None]:
+def _share(model: mjx.Model, data: mjx.Data, block: Block, how: Onset | _Vector) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and its other side; None where no sides can change."""
     rates = block.map.mv(data.qvel).reshape(-1, block.rows_each)
     rate, distance = _normal(block, rates), block.residual[:: block.rows_each]
@@ -237,9 +232,9 @@ def _share(
         least = 2 * _AT_MOTION * _depth(block.solimp[:: block.rows_each])
         ahead = model.opt.timestep * jnp.abs(_normal(block, block.map.mv(how).reshape(-1, block.rows_each)))
         width = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(travel, ahead), least))
-    if contacts is None:
+    if block.slots is None:
         return _ramp(distance, width, 0.5), None
-    slots = slot_geoms(model, data)
+    slots, contacts = slot_geoms(model, data), slice(*block.slots)
     geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
     share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
     return share, _side(model, data, block, contacts, geoms, rate, least)

@@ -45,11 +45,12 @@ class Block(eqx.Module):
     rows_each: int = eqx.field(static=True, default=0, kw_only=True)
     # Whether the rows are edges of pyramids, whose mean is the normal row; otherwise the first row is.
     is_pyramid: bool = eqx.field(static=True, default=False, kw_only=True)
-    is_contact: bool = eqx.field(static=True, default=False, kw_only=True)
+    # First slot of contacts, and one after the last; None for other rows.
+    slots: tuple[int, int] | None = eqx.field(static=True, default=None, kw_only=True)
 
 
 def joined(blocks: list[Block]) -> Block:
-    """Return all rows as one block, without `rows_each`, `is_pyramid` and `is_contact`."""
+    """Return all rows as one block, without `rows_each`, `is_pyramid` and `slots`."""
     if any(block.drift is not None for block in blocks):
         still = [jnp.zeros_like(x.residual) if x.drift is None else x.drift for x in blocks]
         blocks = [dataclasses.replace(x, drift=drift) for x, drift in zip(blocks, still, strict=True)]
@@ -115,7 +116,7 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
         is_active=residual < 0 if is_pyramid else spread(distance < 0),
         rows_each=each,
         is_pyramid=is_pyramid,
-        is_contact=True,
+        slots=(first, first + count),
     )
 
 

@@ -100,7 +100,7 @@ def smoothed(
 
     For rows without noise its numbers are not used. If no row is smoothed, noise is None and the rest is unchanged.
     """
-    contact, num_contacts, start = data._impl.contact, 0, 0
+    contact, start = data._impl.contact, 0
     has_distance = jnp.ones(len(contact.dist), bool)
     if np.isin(model.geom_type, CONVEX).any() and len(contact.dist):
         # A ball on a box has a known distance, but beyond a metre it does not matter.
@@ -108,12 +108,10 @@ def smoothed(
     rows, noises, first = [], [], None
     for block in blocks:
         count = len(block.residual)
-        if not block.rows_each or not block.is_contact:
+        if block.slots is None:
             noise = Noise(jnp.ones_like(block.residual), jnp.zeros_like(block.residual))
         else:
-            known = has_distance[num_contacts : num_contacts + count // block.rows_each]
-            num_contacts += count // block.rows_each
-            block, noise = noisy(model, block, known, smoothing)
+            block, noise = noisy(model, block, has_distance[slice(*block.slots)], smoothing)
             first = start if first is None else first
         rows.append(block)
         noises.append(noise)

@@ -72,7 +72,7 @@ def test_no_contact_acts_from_farther_than_the_reach():
     def look(qpos, qvel):
         data = mg.forward(model, scene.data.replace(qpos=qpos, qvel=qvel))
         rows, _ = onsets.begin(model, data, gather(model, data), mg.Onset())
-        active = jnp.concatenate([row.is_active[:: row.rows_each] for row in rows if row.is_contact])
+        active = jnp.concatenate([row.is_active[:: row.rows_each] for row in rows if row.slots])
         contact = data._impl.contact
         farthest = jnp.max(jnp.where(active, contact.dist - contact.includemargin, -jnp.inf))
         return farthest, onsets.reach(model, data, mg.Onset())
