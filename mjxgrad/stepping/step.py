@@ -14,7 +14,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from mjxgrad._arrays import instance, is_known_to_be
 from mjxgrad._mjx import mjx
@@ -25,7 +25,7 @@ from mjxgrad.contact.collision import collide
 from mjxgrad.solver import implicit
 from mjxgrad.solver.constraint import RowLayout, Rows
 from mjxgrad.solver.jacobian import as_rows
-from mjxgrad.solver.newton import System, Variant
+from mjxgrad.solver.newton import System
 from mjxgrad.stepping import assembly, onset
 from mjxgrad.stepping.contact import Contact, Discrete, Onset, Slope, Smoothing, check_contact
 from mjxgrad.stepping.onset import TwoSolves
@@ -134,14 +134,7 @@ def _forward(
         data = _unconstrained(data)
     else:
         system = assembly.system_of(model, data, layout, joined(rows), noise)
-        iterations, start, tolerance = _solver_settings(model, data)
-        if solves is None:
-            found = implicit.solve(layout, iterations, system, start, tolerance)
-            data = _solved(data, layout, system, *found)
-        else:
-            pair = (solves.variants, solves.is_split)
-            found = implicit.solve_both(layout, iterations, system, *pair, start, tolerance)
-            data = _mixed(data, layout, system, solves, *found)
+        data = _solved(model, data, layout, system, solves)
     return mended.sensor_acc(model, data) if model.nsensor else data
 
 
@@ -166,15 +159,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         system = System(Inertia(mjx.full_m(model, data)), data.qfrc_smooth, entries, active, rows)
         if not layout.num_rows or not model.nv:
             return _unconstrained(data)
-        iterations, start, tolerance = _solver_settings(model, data)
-        return _solved(data, layout, system, *implicit.solve(layout, iterations, system, start, tolerance))
-
-
-def _solver_settings(model: mjx.Model, data: mjx.Data) -> tuple[int, _Vector, Float[Array, ""]]:
-    """Return the limit on iterations, the start of the solve, and its tolerance."""
-    is_cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
-    start = jax.lax.stop_gradient(data.qacc_smooth if is_cold else data.qacc_warmstart)
-    return int(model.opt.iterations), start, jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
+        return _solved(model, data, layout, system)
 
 
 def _unconstrained(data: mjx.Data) -> mjx.Data:
@@ -183,39 +168,30 @@ def _unconstrained(data: mjx.Data) -> mjx.Data:
 
 
 def _solved(
-    data: mjx.Data, layout: RowLayout, system: System, acceleration: _Vector, num_iterations: Int[Array, ""]
+    model: mjx.Model, data: mjx.Data, layout: RowLayout, system: System, solves: TwoSolves | None = None
 ) -> mjx.Data:
-    """Return data with the acceleration that balances all forces, and the forces of the rows."""
-    force = system.row_force(layout, acceleration)
-    return _with_forces(data, acceleration, force, system.rmv(force), num_iterations)
+    """Return data with the acceleration that balances all forces, and the rows' forces; of two solves the weighted means."""
+    is_cold = model.opt.disableflags & _Disable.mjDSBL_WARMSTART
+    start = jax.lax.stop_gradient(data.qacc_smooth if is_cold else data.qacc_warmstart)
+    tolerance = jax.lax.stop_gradient(jnp.asarray(model.opt.tolerance, data.qvel.dtype))
+    iterations = int(model.opt.iterations)
 
+    def with_forces(system: System, acceleration: _Vector) -> tuple[Array, Array, Array]:
+        force = system.row_force(layout, acceleration)
+        return acceleration, force, system.rmv(force)
 
-def _mixed(
-    data: mjx.Data,
-    layout: RowLayout,
-    system: System,
-    solves: TwoSolves,
-    both: Float[Array, "2 nv"],
-    num_iterations: Int[Array, ""],
-) -> mjx.Data:
-    """Return data with the mean of two solves, weighted by the share of the first."""
-
-    def forces(variant: Variant, acceleration: Array) -> tuple[Array, Array]:
-        varied = system.with_variant(variant)
-        force = varied.row_force(layout, acceleration)
-        return force, varied.rmv(force)
-
-    # In this order the result equals a single solve to the last bit where the two do not differ.
-    acceleration, force, total = (
-        x[1] + solves.share * (x[0] - x[1]) for x in (both, *jax.vmap(forces)(solves.variants, both))
-    )
-    return _with_forces(data, acceleration, force, total, num_iterations)
-
-
-def _with_forces(data: mjx.Data, acceleration: Array, force: Array, total: Array, num_iterations: Array) -> mjx.Data:
-    count = num_iterations.astype(data._impl.solver_niter.dtype)
-    found = {"_impl.efc_force": force, "_impl.solver_niter": count}
-    return data.tree_replace({"qacc": acceleration, "qfrc_constraint": total, **found})  # pyright: ignore[reportReturnType]
+    if solves is None:
+        acceleration, count = implicit.solve(layout, iterations, system, start, tolerance)
+        found = with_forces(system, acceleration)
+    else:
+        pair = (solves.variants, solves.is_split)
+        both, count = implicit.solve_both(layout, iterations, system, *pair, start, tolerance)
+        each = jax.vmap(lambda variant, a: with_forces(system.with_variant(variant), a))(solves.variants, both)
+        # In this order the result equals a single solve to the last bit where the two do not differ.
+        found = (x[1] + solves.share * (x[0] - x[1]) for x in each)
+    acceleration, force, total = found
+    rows = {"_impl.efc_force": force, "_impl.solver_niter": count.astype(data._impl.solver_niter.dtype)}
+    return data.tree_replace({"qacc": acceleration, "qfrc_constraint": total, **rows})  # pyright: ignore[reportReturnType]
 
 
 @jax.custom_jvp
