@@ -100,7 +100,8 @@ def warned(call, *arguments, **how):
 
 
 def identify(measured=five, recordings=None, **how):
-    recordings = [fit.Recording({"qpos": measured})] if recordings is None else recordings
+    controls = np.zeros((len(measured) - 1, 1))
+    recordings = [fit.Recording({"qpos": measured}, controls)] if recordings is None else recordings
     return mg.identify(scene, {"a": fit.Parameter(1.0)}, recordings, **how)
 
 
@@ -270,6 +271,7 @@ FOUND = {
     "stack(scene, [fit.Recording({'speed': five})])": "there is no sensor 'speed'",
     "identify(recordings=[])": "recordings must hold at least one",
     "identify(np.full(5, np.nan))": "got NaN alone",
+    "identify(recordings=[fit.Recording({'qpos': five})])": "controls of the recording must be given in a scene with actuators",
     "identify(delay='b')": "delay must name one",
     "fit.Parameter(3.0, 0.0, 1.0)": "lower, nominal and upper must increase",
     "fit.Parameter([1.0, 2.0], [0.0, 0.0, 0.0])": "lower must be one number or of shape",
