@@ -54,8 +54,11 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
     least = sorted(one[0] for one in signals)[-_MOST_SIGNALS:][0]
     panel = functools.partial(_panel, float(scene.model.opt.timestep), fitted_until)
     drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals if one[0] >= least]
-    chatters = " as one of many motions, since contacts chatter" * (result.num_motions > 1)
-    caption = f"SI units. Dots: measured. Dashed: where the search began. Line: with the values found{chatters}. Grey: held out."
+    caption = "SI units. Dots: measured. Dashed: where the search began. Line: with the values found. Grey: held out."
+    if result.num_motions > 1:
+        caption += (
+            f" Contacts chatter: one motion, as this line, parts from the dots; the mean of {result.num_motions} fits."
+        )
     if len(signals) > len(drawings):
         caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
     return Block(drawings=drawings, caption=caption)

@@ -31,7 +31,7 @@ class Recording:
         times: times of the measurements from the start (s), increasing; None for one at each state.
         control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
-            (m, rad). The default is 1. Ratios weigh the signals; the overall size is estimated.
+            (m, rad). The default is 1.
         start: the state at time 0; None for what was measured then, else the scene's pose, at rest.
         name: name in messages.
         knows_noise: whether `noise` is that of the measurements; otherwise it only weighs the signals.
