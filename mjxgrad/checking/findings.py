@@ -140,11 +140,9 @@ def engine_finding(scene: Scene, motions: Motions) -> Finding:
         return Finding("engines", f"{scene.unsupported}.")
     rng, whole = np.random.default_rng(0), np.flatnonzero(motions.bad_steps < 0)
     at = rng.choice(whole, _NUM_COMPARED), rng.integers(motions.controls.shape[1], size=_NUM_COMPARED)
-    states, ends = (
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *(one.tolist() for one in at))),
-        [],
-    )
+    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *(one.tolist() for one in at)))
     scene = eqx.tree_at(lambda s: s.model.opt.tolerance, scene, jnp.full_like(scene.model.opt.tolerance, 1e-14))
+    ends = []
     for engine in ("mjx", "mujoco"):
         run = functools.partial(rollout, scene, contact=own_motion("discrete", engine))
         found = jax.jit(jax.vmap(lambda state, control, run=run: run(state, control[None]).qvel[-1]))

@@ -146,7 +146,7 @@ def _alone(
     The sum of squares has many minima, by noisy starts or by chatter. Others' distances, weighed by likelihood, are what the
     covariance about one of them lacks.
     """
-    ends, squares, count = [end], [float("inf")], len(program.coordinates.names)
+    ends, count = [end], len(program.coordinates.names)
     total = lambda one: float(jnp.sum(one.found[0] ** 2)) / many.noise**2  # noqa: E731
     for values, starts in many.alone:
         squares, left = [total(one) for one in ends], max_steps - sum(one.num_steps for one in ends)
