@@ -2,6 +2,7 @@
 
 import functools
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -18,7 +19,7 @@ from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.rollouts import rollout
 from mjxgrad.rollouts.state import LARGEST_GROWTH
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneError, load_scene
 from mjxgrad.stepping import own_motion
 
 Kind = Literal[
@@ -137,7 +138,11 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
 def engine_finding(scene: Scene, motions: Motions) -> Finding:
     """Compare a step by MJX, which is compiled, with C MuJoCo's, both solved to rounding, in states of the motions."""
     if scene.unsupported:
-        return Finding("engines", f"{scene.unsupported}.")
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                scene = load_scene(scene.to_mujoco(), engine="mjx")
+        except SceneError as error:
+            return Finding("engines", f"{error}.")
     rng, whole = np.random.default_rng(0), np.flatnonzero(motions.bad_steps < 0)
     at = rng.choice(whole, _NUM_COMPARED), rng.integers(motions.controls.shape[1], size=_NUM_COMPARED)
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *(one.tolist() for one in at)))

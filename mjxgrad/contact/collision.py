@@ -1,17 +1,9 @@
 """Contacts between geoms: MJX's pairs and slots, and some of its functions.
 
-Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`. Five more kinds of pair differ from MJX.
-
-- A box on a plane. MJX takes corners within 1 mm of the deepest one, and loses others that still touch. C MuJoCo and this
-  library take the lower end of each of the four diagonals, so a contact always belongs to the same diagonal.
-- Two faces, one of them of a mesh. MJX's contacts lie on the clipping face; C MuJoCo's and ours lie half way between both faces.
-  For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns one contact at their far ends.
-- A ball on a box. MJX knows the distance only where they overlap; the nearest point of a box is known everywhere.
-- A ball on a cylinder. MJX takes ten steps of a search; the nearest point of a cylinder has a closed form.
-- A cylinder standing on a plane. MJX takes three points of the rim, the lowest one first, and derives the height of the other
-  two from it. An upright cylinder has no lowest point: MJX picks a fixed one, and the heights of the other two do not depend on
-  a tilt about it. Their positions do: each lies half its distance from the rim towards the plane. So n·(p - o) + d/2 is the
-  height of the rim above the plane, and its derivative is correct in every pose.
+Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`, and of boxes and cylinders with planes,
+balls and capsules in `solids`. Where two faces touch, one of them of a mesh, MJX's contacts lie on the clipping face; C MuJoCo's
+and ours lie half way between both faces. For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns
+one contact at their far ends. All other kinds of pair are MJX's.
 """
 
 import sys
@@ -26,11 +18,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._mjx import COLLISION_FUNCTIONS as _PLAIN
-from mjxgrad._mjx import contact_groups, custom_number, geom_groups, make_frame, mjx
+from mjxgrad._mjx import contact_groups, custom_number, geom_groups, mjx
 from mjxgrad.batched import maps
-from mjxgrad.batched.maps import contract, dot, pick, safe_norm
+from mjxgrad.batched.maps import pick
 from mjxgrad.bodies.mended import copy_of
-from mjxgrad.contact import boxes, capsules
+from mjxgrad.contact import boxes, capsules, solids
 
 _PerPair = Float[Array, " pairs"]
 _Frames = Float[Array, "pairs 3 3"]
@@ -45,9 +37,9 @@ _PLANE, _HEIGHT_FIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _BOX, _CYLINDER, _MESH = (
 CONVEX, WITHOUT_CENTRE = (_BOX, _MESH, _HEIGHT_FIELD), (_PLANE, _HEIGHT_FIELD, _MESH)
 # Contacts with another convex geom; of flat faces C MuJoCo finds four.
 _OF_ROUND = {_SPHERE: 1, _ELLIPSOID: 1, _CAPSULE: 2}
+_SLOTS = {(_BOX, _BOX): boxes.NUM_CONTACTS, (_PLANE, _CYLINDER): 4}  # unlike MJX
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """Types without a bounding sphere."""
-_DIAGONALS = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [1, -1, -1]])
 # Weight of a ball's distance outside an edge: both faces act on it only close to the edge.
 _ROUND_EDGES = 4.0
 # Length of an edge times a distance from a plane (m²) below which the product is rounding, in either precision.
@@ -115,8 +107,8 @@ def candidates(model: mjx.Model) -> dict[int, np.ndarray]:
 def most_contacts(kinds: tuple[SupportsInt, SupportsInt]) -> int:
     """Return the largest number of contacts of a pair of geoms of two types."""
     first, second = map(int, kinds)
-    if (first, second) == (_BOX, _BOX):
-        return boxes.NUM_CONTACTS
+    if (first, second) in _SLOTS:
+        return _SLOTS[first, second]
     if (first, second) in _MJX_FUNCTIONS:
         return _MJX_FUNCTIONS[first, second].ncon  # pyright: ignore
     return min(_OF_ROUND.get(kind, 4) for kind in (first, second))  # C MuJoCo's, which alone steps such pairs
@@ -144,11 +136,10 @@ def first_missed(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
 
 def is_blind(model: mjx.Model, geoms: Array | np.ndarray) -> Array | np.ndarray:
     """Return which pairs have a known distance only where they overlap."""
-    is_plane, is_sphere, is_box, is_convex = (
-        are(model, geoms, kinds) for kinds in ((_PLANE,), (_SPHERE,), (_BOX,), CONVEX)
+    is_plane, is_round, is_box, is_convex = (
+        are(model, geoms, kinds).any(axis=1) for kinds in ((_PLANE,), (_SPHERE, _CAPSULE), (_BOX,), CONVEX)
     )
-    is_ball_on_box = is_sphere.any(axis=1) & is_box.any(axis=1)
-    return is_convex.any(axis=1) & ~is_plane.any(axis=1) & ~is_ball_on_box  # pyright: ignore[reportReturnType]
+    return is_convex & ~is_plane & ~(is_round & is_box)  # pyright: ignore[reportReturnType]
 
 
 def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> Array | np.ndarray:
@@ -179,15 +170,15 @@ def other_sides(
 
 def _next_face(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[_Points, _Frames, _PerPair]:
     """Return position and frame of a ball's contact with a box's second nearest face, and how much farther that is."""
-    distance, outward, beyond, sign = _from_box(model, data, geoms)
-    nearest = _largest(beyond)
+    distance, outward, beyond, sign = solids.from_box(model, data, geoms)
+    nearest = solids.largest(beyond)
     opposite = -beyond - 2 * pick(geoms[:, 1], model.geom_size)
     rest = jnp.where(nearest, opposite, beyond)
-    second = _largest(rest)
+    second = solids.largest(rest)
     along_nearest, along_second = (jnp.sum(jnp.abs(outward) * axis, axis=1)[:, None] for axis in (nearest, second))
     traded = outward + sign * (along_second - along_nearest) * (1.0 * nearest - 1.0 * second)
     is_opposite = jnp.any(nearest & second, axis=1)
-    pos, frame = _towards(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
+    pos, frame = solids.towards(model, data, geoms, distance, jnp.where(is_opposite[:, None], -outward, traded))
     next_one = jnp.max(rest, axis=1)
     # Round an edge the normal turns continuously with the ball, so the contact need not change sides.
     return pos, frame, jnp.max(beyond, axis=1) - next_one + _ROUND_EDGES * jnp.where(next_one > 0, next_one, 0.0)
@@ -207,22 +198,6 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
     return chosen.replace(dist=dist[:, 0], pos=pos, frame=frame.reshape(-1, 3, 3))
 
 
-def _plane_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return contacts at the lower end of each diagonal of the box, |n·diagonal| below the centre."""
-    plane, box = geoms.T
-    normal, centre = pick(plane, data.geom_xmat)[:, :, 2], pick(box, data.geom_xpos)
-    height = dot(normal, centre - pick(plane, data.geom_xpos))
-    halves = jnp.asarray(_DIAGONALS, centre.dtype) * pick(box, model.geom_size)[:, None]
-    diagonal = contract("pij,pdj->pdi", pick(box, data.geom_xmat), halves)
-    rise = contract("pi,pdi->pd", normal, diagonal)
-    to_lower = jnp.where(rise > 0, -1, 1)
-    dist = height[:, None] + to_lower * rise
-    corner = centre[:, None] + to_lower[..., None] * diagonal
-    pos = corner - 0.5 * dist[..., None] * normal[:, None]
-    frame = jnp.repeat(jax.vmap(make_frame)(normal), len(_DIAGONALS), axis=0)
-    return dist.reshape(-1), pos.reshape(-1, 3), frame
-
-
 def _box_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
     first, second = (
         boxes.Box(pick(geom, data.geom_xpos), pick(geom, data.geom_xmat), pick(geom, model.geom_size))
@@ -232,79 +207,12 @@ def _box_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Fou
     return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
 
-def _plane_cylinder(model: mjx.Model, data: mjx.Data, key, geoms: _Pairs) -> capsules.Found:
-    """Return MJX's contacts, with the derivative of the distance that MJX drops."""
-    dist, pos, frame = _MJX_FUNCTIONS[key.types](model, data, key, geoms)
-    on_plane = jnp.repeat(pick(geoms[:, 0], data.geom_xpos), len(dist) // len(geoms), axis=0)
-    height = dot(frame[:, 0], pos - on_plane) + 0.5 * dist
-    # Only the derivative is replaced; the value is MJX's.
-    return jax.lax.stop_gradient(dist - height) + height, pos, frame
-
-
-def _sphere_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return contacts at the point of the box nearest to the ball's centre; on the nearest face if it is inside."""
-    distance, outward, *_ = _from_box(model, data, geoms)
-    pos, frame = _towards(model, data, geoms, distance, outward)
-    return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
-
-
-def _sphere_cylinder(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    """Return contacts at the point of the cylinder nearest to the ball's centre; on the nearer of side and end if inside."""
-    centre = _centre_in(data, geoms)
-    radius = safe_norm(centre[:, :2])
-    on_axis = (radius < 1e-12)[:, None]  # m; below it the radial direction's derivative overflows
-    radial = jnp.where(on_axis, jnp.array([1.0, 0.0]), centre[:, :2] / jnp.where(on_axis, 1.0, radius[:, None]))
-    # Coordinates in the half-plane of axis and centre: radial, axial.
-    beyond = jnp.stack([radius, jnp.abs(centre[:, 2])], axis=1) - pick(geoms[:, 1], model.geom_size)[:, :2]
-    sign = jnp.stack([jnp.ones_like(radius), jnp.where(centre[:, 2] < 0, -1.0, 1.0)], axis=1)
-    distance, outward = _from_faces(beyond, sign)
-    outward = jnp.concatenate([outward[:, :1] * radial, outward[:, 1:]], axis=1)
-    pos, frame = _towards(model, data, geoms, distance, outward)
-    return distance - pick(geoms[:, 0], model.geom_size)[:, 0], pos, frame
-
-
-def _from_box(model: mjx.Model, data: mjx.Data, geoms: _Pairs) -> tuple[Array, Array, Array, Array]:
-    """Return distance and direction of a ball's centre from a box, and its distances and signs along the axes."""
-    centre = _centre_in(data, geoms)
-    beyond, sign = jnp.abs(centre) - pick(geoms[:, 1], model.geom_size), jnp.where(centre < 0, -1.0, 1.0)
-    return *_from_faces(beyond, sign), beyond, sign
-
-
-def _centre_in(data: mjx.Data, geoms: _Pairs) -> _Points:
-    """Return the centre of the first geom in the frame of the second."""
-    away = pick(geoms[:, 0], data.geom_xpos) - pick(geoms[:, 1], data.geom_xpos)
-    return contract("pji,pj->pi", pick(geoms[:, 1], data.geom_xmat), away)
-
-
-def _from_faces(beyond: Float[Array, "pairs k"], sign: Float[Array, "pairs k"]) -> tuple[_PerPair, Array]:
-    """Return distance and direction of a point from a body with faces at right angles; from the nearest one if inside."""
-    is_inside = jnp.all(beyond <= 0, axis=1)
-    gap = sign * jnp.where(beyond > 0, beyond, 0.0)
-    length, nearest = safe_norm(gap), sign * _largest(beyond)
-    outward = jnp.where(is_inside[:, None], nearest, gap / jnp.where(length > 0, length, 1.0)[:, None])
-    return jnp.where(is_inside, jnp.max(beyond, axis=1), length), outward
-
-
-def _towards(
-    model: mjx.Model, data: mjx.Data, geoms: _Pairs, distance: _PerPair, outward: _Points
-) -> tuple[_Points, _Frames]:
-    """Return position and frame of contacts, half way between both surfaces."""
-    sphere, other = geoms.T
-    normal = contract("pij,pj->pi", pick(other, data.geom_xmat), -outward)
-    reach = 0.5 * (distance + pick(sphere, model.geom_size)[:, 0])
-    return pick(sphere, data.geom_xpos) + reach[:, None] * normal, jax.vmap(make_frame)(normal)
-
-
-def _largest(x: Float[Array, "pairs k"]) -> Array:
-    """Return whether each number of an item is the largest."""
-    return jnp.arange(x.shape[1]) == jnp.argmax(x, axis=1)[:, None]
-
-
 _FUNCTIONS = {
-    (_PLANE, _BOX): _plane_box,
-    (_PLANE, _CYLINDER): _plane_cylinder,
-    (_SPHERE, _BOX): _sphere_box,
-    (_SPHERE, _CYLINDER): _sphere_cylinder,
+    (_PLANE, _BOX): solids.plane_box,
+    (_PLANE, _CYLINDER): solids.plane_cylinder,
+    (_SPHERE, _BOX): solids.sphere_box,
+    (_SPHERE, _CYLINDER): solids.sphere_cylinder,
+    (_CAPSULE, _BOX): solids.capsule_box,
     (_BOX, _BOX): _box_box,
 }
 

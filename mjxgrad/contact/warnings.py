@@ -57,29 +57,6 @@ def contact_warnings(model: mjx.Model, pairs: Pairs) -> list[str]:
     return _grouped(found)
 
 
-def contact_differences(model: mujoco.MjModel, pairs: Pairs, *, only_often: bool = False) -> list[str]:
-    """Return one sentence per kind of pair for which MJX and C MuJoCo find different contact points, perhaps only often."""
-    geom = mujoco.mjtGeom
-    kinds = {frozenset(geom(t) for t in model.geom_type[[p.geom1, p.geom2]]) for p in pairs}
-    plane, capsule, box, mesh = geom.mjGEOM_PLANE, geom.mjGEOM_CAPSULE, geom.mjGEOM_BOX, geom.mjGEOM_MESH
-    often = [("capsule with box", {capsule, box}), ("capsule with mesh", {capsule, mesh})]
-    often += [("box with mesh", {box, mesh}), ("mesh with mesh", {mesh})]
-    found = [
-        f"{name}: MJX has rules of its own, and often other contacts than C MuJoCo, which steps it as mg.Slope('mujoco')"
-        for name, kind in often
-        if kind in kinds
-    ]
-    rarely = (
-        ({plane, mesh}, "mesh on plane: MJX keeps only corners within 1 mm of the deepest one"),
-        (
-            {plane, geom.mjGEOM_CYLINDER},
-            "cylinder that nearly lies on a plane: MJX makes up to three contacts, C MuJoCo four",
-        ),
-        ({capsule}, "parallel capsules: MJX makes one contact, C MuJoCo two"),
-    )
-    return found if only_often else found + [message for kind, message in rarely if kind in kinds]
-
-
 def steepest(
     stiffness: float, damping: float, impedance: Float[np.ndarray, "2"] | tuple[float, float], width: float
 ) -> tuple[float, float]:

@@ -21,7 +21,6 @@ from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.contact.warnings import contact_differences
 from mjxgrad.scene.conversions import (
     AFTER_REFUSALS,
     BEFORE_REFUSALS,
@@ -30,7 +29,7 @@ from mjxgrad.scene.conversions import (
     kinematics_alone,
     switch_off,
 )
-from mjxgrad.scene.refusals import refusal_messages
+from mjxgrad.scene.refusals import REFUSALS, UNLIKE, refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
@@ -64,7 +63,8 @@ def load_scene(
         max_contacts: number of contact slots per friction dimension (`condim`), for the nearest contacts; only these cost
             anything in the solve. None has room for all possible contacts. `Trajectory.crowded` counts the steps that filled
             all slots.
-        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None prefers MJX.
+        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None prefers MJX, but
+            not for contacts of meshes and height fields, which MJX finds by rules of its own.
 
     Returns:
         The scene. `print(scene.summary())` describes it.
@@ -102,9 +102,11 @@ def load_scene(
     messages = [f"MuJoCo says: {text}" for text in told]
     messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
     head, *more = unsupported.splitlines() or [""]
-    reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [head])
+    alone = head.removeprefix(f"{name} cannot be stepped by MJX: ")
+    reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [alone])
     messages += [f"C MuJoCo steps it: {reasons}; see scene.unsupported"] if unsupported and engine is None else []
-    messages += contact_differences(mj_model, pairs, only_often=True) if not unsupported else []
+    if not unsupported:
+        messages += [text.partition("; load")[0] for text in refusal_messages(mj_model, [UNLIKE])]
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))
@@ -193,7 +195,7 @@ def _converted(
                 "pip install 'mjxgrad[mjx]' for MJX's step"
             )
         conversions = [c for rule in BEFORE_REFUSALS for c in rule(model)]
-        refused = refusal_messages(model)
+        refused = refusal_messages(model, REFUSALS if engine == "mjx" else (*REFUSALS, UNLIKE))
         if len(refused) == 1:
             raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
         if refused:

@@ -20,7 +20,9 @@ _GEOM = mujoco.mjtGeom
 _INTEGRATOR = mujoco.mjtIntegrator
 _SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
 _SEARCHED = {_GEOM.mjGEOM_ELLIPSOID.value, _GEOM.mjGEOM_CYLINDER.value}
-_SMOOTH = _SEARCHED | {_GEOM.mjGEOM_SPHERE.value, _GEOM.mjGEOM_CAPSULE.value}
+_CAPSULE = _GEOM.mjGEOM_CAPSULE.value
+_SHAPED = {_GEOM.mjGEOM_MESH.value, _GEOM.mjGEOM_HFIELD.value}
+_SMOOTH = _SEARCHED | {_GEOM.mjGEOM_SPHERE.value, _CAPSULE}
 
 
 def element_name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:
@@ -113,7 +115,7 @@ def _is_searched(_: mujoco.MjModel, __: ContactPair, kinds: list[int]) -> bool:
 def _has_mesh_margin(model: mujoco.MjModel, pair: ContactPair, kinds: list[int]) -> bool:
     margin = model.geom_margin[[pair.geom1, pair.geom2]].sum()
     margin = model.pair_margin[pair.explicit] if pair.explicit >= 0 else margin
-    return bool(margin) and bool({_GEOM.mjGEOM_MESH.value, _GEOM.mjGEOM_HFIELD.value}.intersection(kinds))
+    return bool(margin) and bool(_SHAPED.intersection(kinds))
 
 
 _LAWS = (
@@ -235,10 +237,17 @@ REFUSALS: tuple[tuple[str, Callable[[mujoco.MjModel], Iterable[str]], str], ...]
 )  # fmt: skip
 
 
-def refusal_messages(model: mujoco.MjModel) -> list[str]:
+# Of random poses that touch, up to 60 in 100 accelerate otherwise by more than 1 %.
+UNLIKE = ("contacts of meshes and height fields like C MuJoCo's", _pairs(lambda _, __, kinds: _SHAPED.intersection(kinds)),
+          "load it with engine='mjx' to have MJX's own")  # fmt: skip
+PARALLEL = ("second contact of capsules that are exactly parallel", _pairs(lambda _, __, kinds: set(kinds) == {_CAPSULE}),
+            "C MuJoCo has it")  # fmt: skip
+
+
+def refusal_messages(model: mujoco.MjModel, refusals: Iterable[tuple] = REFUSALS) -> list[str]:
     """Return one sentence per feature that MJX cannot simulate."""
     messages = []
-    for feature, find, remedy in REFUSALS:
+    for feature, find, remedy in refusals:
         if found := list(find(model)):
             more = f" and {len(found) - 4} more" if len(found) > 4 else ""
             messages.append(f"MJX has no {feature}, got {', '.join(found[:4])}{more}; {remedy}")

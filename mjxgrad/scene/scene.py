@@ -21,9 +21,9 @@ from mjxgrad.bodies import constants
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
-from mjxgrad.contact.warnings import contact_differences, contact_warnings
+from mjxgrad.contact.warnings import contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
-from mjxgrad.scene.refusals import has_medium
+from mjxgrad.scene.refusals import PARALLEL, UNLIKE, has_medium, refusal_messages
 from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
@@ -179,13 +179,14 @@ class Scene(eqx.Module):
             raise ValueError("summary needs one scene with known values, got a batched or traced one")
         differs = " (moves differently from C MuJoCo)"
         converted = [(c.what, f"{c.given} → {c.used}", c.reason + differs * (not c.exact)) for c in self.conversions]
+        unlike = () if self.unsupported else refusal_messages(self.mj_model, [UNLIKE, PARALLEL])
         sections = [
             _heading(self),
             f"Stepped by C MuJoCo: {self.unsupported}" if self.unsupported else "",
             _contacts(self),
             _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),
-            _table("Contacts unlike C MuJoCo", [(text,) for text in contact_differences(self.mj_model, self.pairs)]),
+            _table("Unlike C MuJoCo", [(text,) for text in unlike]),
             _table("Warnings", [(text,) for text in self.warnings()]),
         ]
         return "\n\n".join(section for section in sections if section)

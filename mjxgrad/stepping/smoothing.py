@@ -87,8 +87,8 @@ def smoothing_warnings(model: mjx.Model) -> list[str]:
     if blind:
         shown = ", ".join(blind[:4]) + (f" and {len(blind) - 4} more" if len(blind) > 4 else "")
         messages.append(
-            f"smoothing gives no force at a distance to {shown}: MJX knows the distance of a box, mesh or height field from "
-            "anything but a plane only where they overlap; build them of spheres and capsules"
+            f"smoothing gives no force at a distance to {shown}: the distance of two boxes, or of a mesh or height field, is "
+            "known only where they overlap; build them of spheres and capsules"
         )
     return messages
 

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import mjxgrad as mg
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.contact.collision import collide, slot_geoms
@@ -37,8 +38,8 @@ def finder(model, start):
 def loaded(xml):
     """Return C's model, the geoms of the slots, and the function from positions to contacts."""
     mj_model = mujoco.MjModel.from_xml_string(xml)
-    model, start = mjx.put_model(mj_model), mjx.make_data(mj_model)
-    return mj_model, slot_geoms(model, start), finder(model, start)
+    scene = mg.load_scene(mj_model, keep_everything=True)
+    return mj_model, slot_geoms(scene.model, scene.data), finder(scene.model, scene.data)
 
 
 def poses(seed, num_bodies=5, spread=0.2):

@@ -10,6 +10,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad._mjx import mjx
+from mjxgrad.contact.boxes import ABSENT
 from mjxgrad.contact.collision import collide, slot_geoms
 from tests.contact.test_capsules import TILTED, by_pair_and_depth, finder, loaded, poses
 from tests.scenes import central_difference, put
@@ -46,6 +47,9 @@ CAN = """
 """
 two_poses = functools.partial(poses, num_bodies=2, spread=0.1)
 BALL_AND_BOX = CAN.replace('type="cylinder" size=".1 .15"', 'type="box" size=".1 .2 .05"').replace(".07", ".03")
+ROD_ON_BOX = BALL_AND_BOX.replace('size=".03"', 'type="capsule" size=".03 .15"')
+CYLINDER = """<mujoco><worldbody><geom type="plane" size="1 1 1" euler="10 20 0" margin="5"/>
+<body><freejoint/><geom type="cylinder" size=".1 .15"/></body></worldbody></mujoco>"""
 
 
 @pytest.mark.parametrize(
@@ -71,11 +75,45 @@ def test_they_touch_where_they_do_in_c(xml, num_contacts, num_places):
     assert len(places) == num_places or xml is BOXES
 
 
+@pytest.mark.parametrize("is_double", [True, False])
+@pytest.mark.parametrize(
+    ("xml", "counts"), [(ROD_ON_BOX, {1, 2}), (CYLINDER, {4})], ids=["capsule on box", "cylinder on plane"]
+)
+def test_each_contact_has_its_counterpart_in_c(xml, counts, is_double):
+    """From corners, edges, faces and within; every other pose upright or level but for a small tilt.
+
+    The lowest point of an upright cylinder runs along its rim: rounding over the tilt tells where it is.
+    """
+    random, found = np.random.default_rng(5), set()
+    with jax.enable_x64(is_double):
+        mj_model, _, find = loaded(xml)
+        mj_data = mujoco.MjData(mj_model)
+        for seed in range(200):
+            qpos = poses(seed, mj_model.nbody - 1, 0.2)
+            if seed % 2:
+                tilt = 10 ** random.uniform(-4, -1)
+                quat = random.choice([[1, 0, 0, 0], [0.5**0.5, 0.5**0.5, 0, 0], [0.5**0.5, 0, 0.5**0.5, 0]])
+                qpos[3:7], qpos[10:14] = quat + tilt * random.normal(size=4), [1, 0, 0, 0][: len(qpos) - 10]
+                qpos[3:7] /= np.linalg.norm(qpos[3:7])
+            mj_data.qpos[:] = np.asarray(jnp.asarray(qpos), float)
+            mujoco.mj_forward(mj_model, mj_data)
+            contact, theirs = find(jnp.asarray(qpos)), mj_data.contact
+            ours = np.column_stack([contact.dist, contact.pos, contact.frame.reshape(-1, 9)])[
+                np.asarray(contact.dist) != ABSENT
+            ]
+            apart = np.abs(ours[:, None] - np.column_stack([theirs.dist, theirs.pos, theirs.frame])).max(axis=2)
+            assert len(ours) == len(theirs)
+            assert max(apart.min(axis=axis).max() for axis in (0, 1)) < (1e-11 if is_double else 1e-3)
+            found.add(len(ours))
+    assert found == counts
+
+
 @pytest.mark.parametrize(
     ("xml", "at", "close"),
-    [(BOXES, [two_poses(7)], 1e-9), (CAN, [*map(two_poses, range(4))], 1e-7), (TILTED, [*map(poses, range(4))], 1e-6)],
-    ids=["boxes", "cylinder", "planes, balls and capsules"],
-)
+    [(BOXES, [two_poses(7)], 1e-9), (CAN, [*map(two_poses, range(4))], 1e-7), (TILTED, [*map(poses, range(4))], 1e-6),
+     (ROD_ON_BOX, [*map(two_poses, range(12))], 1e-5), (CYLINDER, [poses(seed, 1) for seed in range(4)], 1e-8)],
+    ids=["boxes", "ball on cylinder", "planes, balls and capsules", "capsule on box", "cylinder"],
+)  # fmt: skip
 def test_contacts_have_the_derivative_of_their_points(xml, at, close):
     """Cubic errors of 1e-5 are beyond rounding, 1e-16 over 1e-5; normals are divided by distances."""
     *_, find = loaded(xml)
@@ -146,9 +184,11 @@ _PRISM = "-.1 -.1 0 .12 -.08 0 0 .1 0 -.1 -.1 .1 .12 -.08 .1 0 .1 .1"
     ],
     ids=["block", "prism"],
 )
+@pytest.mark.filterwarnings("ignore:.*like C MuJoCo's")
 def test_a_mesh_that_stands_on_a_box_touches_at_its_corners_as_in_c(corners, place, count, close):
     scene = mg.load_scene(f"""<mujoco><asset><mesh name="m" vertex="{corners}"/></asset><worldbody>
-      <geom type="box" size=".5 .5 .1"/><body {place}><freejoint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>""")
+      <geom type="box" size=".5 .5 .1"/><body {place}><freejoint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>""",
+      engine="mjx")  # fmt: skip
     data = mujoco.MjData(scene.mj_model)
     mujoco.mj_forward(scene.mj_model, data)
     found = finder(scene.model, scene.data)(scene.data.qpos)

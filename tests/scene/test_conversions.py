@@ -149,7 +149,7 @@ def _num_touching(scene):
     return data.ncon, int((distances < 0).sum())
 
 
-def test_where_mjx_finds_other_contacts_the_summary_says_so():
+def test_where_mjx_finds_other_contacts_c_mujoco_steps_the_scene_or_the_summary_says_so():
     lying = load_scene(
         """
         <mujoco>
@@ -163,18 +163,21 @@ def test_where_mjx_finds_other_contacts_the_summary_says_so():
         """
     )
     assert _num_touching(lying) == (2, 1)
-    assert "parallel capsules: MJX makes one contact, C MuJoCo two" in lying.summary()
+    assert "MJX has no second contact of capsules that are exactly parallel" in lying.summary()
     # The lower corners are at 95 − 100 (1 ± 0.0175 ± 0.035) mm: −10.2, −6.7, −3.2 and 0.3.
     tilted = load_scene(BOX.format(option=""))
     assert _num_touching(tilted) == (3, 3)
-    assert "unlike C MuJoCo" not in tilted.summary()
-    as_mesh = load_scene(
-        BOX.format(option="")
-        .replace('type="box" size="0.1 0.1 0.1"', 'type="mesh" mesh="cube"')
-        .replace("<worldbody>", f"<asset><mesh name='cube' vertex='{CUBE}'/></asset><worldbody>")
-    )
-    assert _num_touching(as_mesh) == (3, 1)
-    assert "mesh on plane: MJX keeps only corners within 1 mm of the deepest" in as_mesh.summary()
+    assert "Unlike C MuJoCo" not in tilted.summary()
+    as_mesh = BOX.format(option="").replace('type="box" size="0.1 0.1 0.1"', 'type="mesh" mesh="cube"')
+    as_mesh = as_mesh.replace("<worldbody>", f"<asset><mesh name='cube' vertex='{CUBE}'/></asset><worldbody>")
+    said = "MJX has no contacts of meshes and height fields like C MuJoCo's"
+    with pytest.warns(SceneWarning, match=f"C MuJoCo steps it: {said}"):
+        assert load_scene(as_mesh).engine == "mujoco"
+    with pytest.warns(SceneWarning, match=f"the MJCF: {said}, got .*mesh"):
+        taken = load_scene(as_mesh, engine="mjx")
+    assert taken.engine == "mjx"
+    assert _num_touching(taken) == (3, 1)
+    assert said in taken.summary()
 
 
 def test_a_sensor_that_mjx_lacks_is_warned_about_and_the_others_stay():
