@@ -5,6 +5,7 @@ takes a change of the start to the end. JAX transposes that recursion, so forwar
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +17,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import LATER, Engine, engine_of
+from mjxgrad.native.engine import LATER, Engine, engine_of, with_later
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -57,27 +58,30 @@ def roll_out(
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        wanted = (*given, *LATER) if gradient == "slope" else tuple(given)
+        wanted = with_later(tuple(given)) if gradient == "slope" else tuple(given)
         jacobians = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=wanted)
-        forced = jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype)
-        for name, change in given.items():
-            is_by_step = name in by_input
-            change = change.reshape(horizon, -1) if is_by_step else change.reshape(-1)
-            forced += jnp.einsum("tsc,tc->ts" if is_by_step else "tsc,c->ts", jacobians[name], change.astype(dtype))
+        forced = {part: jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype) for part in ("", *LATER)}
+        for part, name in itertools.product(forced, given):
+            if (own := f"{part} {name}".strip()) in jacobians:
+                change = given[name].reshape((horizon, -1) if name in by_input else -1).astype(dtype)
+                forced[part] += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", jacobians[own], change)
         zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
         changes = {k: zero(by_start[k]) for k in found}
         to_tangent = functools.partial(position_change, scene.model, start["qpos"])
         moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
         first = jnp.concatenate([moved, changes["qvel"], changes["act"]])
 
-        def advance(carry: tuple[Array, Array], step: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
-            (change, late), (force, matrix, *later) = carry, step
+        def advance(
+            carry: tuple[Array, Array], step: tuple[tuple[Array, Array], ...]
+        ) -> tuple[tuple[Array, Array], Array]:
+            (change, late), ((matrix, force), *later) = carry, step
             product = functools.partial(jnp.einsum, "sc,c->s", precision="highest")
             end = product(matrix, change) + late + force
-            begun, late = (product(part, change) for part in later) if later else (0.0, late)
+            begun, late = (product(part, change) + extra for part, extra in later) if later else (0.0, late)
             return (end - begun, late), end
 
-        steps = forced, *(jacobians[name] for name in ("state", *LATER) if name in jacobians)
+        names = [("state", ""), *zip(LATER, LATER, strict=True)]
+        steps = tuple((jacobians[name], forced[part]) for name, part in names if name in jacobians)
         _, course = jax.lax.scan(advance, (first, jnp.zeros_like(first)), steps)
         nv = scene.model.nv
         parts = jnp.split(course, (nv, 2 * nv), axis=1)

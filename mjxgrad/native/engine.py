@@ -6,7 +6,7 @@ import functools
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._warnings import collected
-from mjxgrad.native.events import Events, Near, Surfaces, clearance, levers_of, undecided
+from mjxgrad.native.events import HAIR, Events, Near, Surfaces, clearance, levers_of, undecided
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
 
@@ -23,7 +23,10 @@ INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "moc
 """What may be given to each step, in the order in which MuJoCo keeps it."""
 START = ("time", "qpos", "qvel", "act")
 LATER = ("begun", "late")
-"""Of a slope over several steps: what events of a step add to its own end, and in its place to the end of the next."""
+"""Of a slope over several steps: what events of a step add to its own end, and in its place to the end of the next.
+
+By the state, and as "begun geom_size" by an input or number.
+"""
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
 _MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE_ACT.value
@@ -133,7 +136,7 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            kept = (*wanted, *LATER) if gradient == "slope" and num_substeps > 1 else wanted
+            kept = with_later(wanted) if gradient == "slope" and num_substeps > 1 else wanted
             shapes, size = self.shapes(kept, sizes).items(), (num_substeps, len(rows))
             found = {k: np.full((*size, *shape), np.nan if k == "end" else 0.0) for k, shape in shapes}
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
@@ -180,7 +183,7 @@ class Engine:
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
         own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
         own |= dict.fromkeys(LATER, (size, size))
-        return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k]) for k in wanted}
+        return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k.split()[-1]]) for k in wanted}
 
     def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
         """Do so many things on all threads; each takes its piece of them."""
@@ -312,10 +315,12 @@ class _Worker:
             mujoco.mj_getState(model, self.data, found["end"], _MOTION)
         row[self.places["warmstart"]] = end[self.places["warmstart"]]
         model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]], following)
+        events = None if near is None else near.events
         self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
+        self._by_others(model, clear, found, self._width(near), events, spanned)
         if near is None:
             return end
-        matrix, nv, events, rest = found["state"], model.nv, near.events, np.eye(model.nv)
+        matrix, nv, rest = found["state"], model.nv, np.eye(model.nv)
         if events is not None:
             rest -= events.moves @ events.rows
             matrix[:, nv : 2 * nv] -= matrix[:, :nv] @ events.moves @ events.ahead
@@ -425,39 +430,62 @@ class _Worker:
             mujoco.mj_setState(model, self.data, row, _ALL)
             sensors = (found.get("C"), found.get("D"))
             mujoco.mjd_transitionFD(model, self.data, width, is_centred, found["state"], by_control, *sensors)
-        for name in found.keys() - {"state", "C", "D", "end", *LATER} - ({"ctrl"} if not is_refused else set()):
-            if name not in INPUTS:
-                self._by_number(model, row, name, found[name])
-                continue
-            for column in range(found[name].shape[1]):
-                ends = [row.copy(), row.copy()]
-                for end, side in zip(ends, (1, -1), strict=True):
-                    end[self.places[name].start + column] += side * width
-                found[name][:, column] = self._difference(model, *ends) / (2 * width)
-                if name == "ctrl" and "D" in found:
+        if is_refused and "ctrl" in found:
+            for column in range(nu):
+                change = width * (np.arange(len(row)) == self.places["ctrl"].start + column)
+                by_control[:, column] = self._difference(model, row + change, row - change) / (2 * width)
+                if "D" in found:
                     found["D"][:, column] = self.sensed / (2 * width)
 
-    def _by_number(self, model: mujoco.MjModel, row: np.ndarray, name: str, jacobian: np.ndarray) -> None:
-        """Write differences by the entries of an array of the model."""
-        holder = model.opt if name.startswith("opt.") else model
-        attribute = name.removeprefix("opt.")
-        present = getattr(holder, attribute, None)
-        if not isinstance(present, float | np.ndarray):
-            return
-        values = np.array(present, float).reshape(-1)
+    def _by_others(
+        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, events: Events | None,
+        spanned: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Write differences by inputs beside controls and by numbers of the model; what moves gaps has its share of events."""
+        for name in (one for one in found if " " not in one and one not in {"state", "ctrl", "C", "D", "end", *LATER}):
+            moves = events.moves if events is not None and _moves_gaps(name) else None
+            changes = self._inputs(row, name, width) if name in INPUTS else self._numbers(model, row, name)
+            for column, (put, size) in enumerate(changes):
+                rates = self._rates(put, size, events) if events is not None and moves is not None else np.zeros(0)
+                shift = moves @ rates if moves is not None else np.zeros(model.nv)
+                ends = [self._step(model, self._moved(model, put(x), -x * shift)) for x in (size, -size)]
+                put(0.0)
+                found[name][:, column] = _change(model, *ends) / (2 * size)
+                if rates.any():
+                    parts = spanned @ rates
+                    found[name][:, column] += parts[0]
+                    if len(parts) > 1:
+                        found[f"begun {name}"][:, column], found[f"late {name}"][:, column] = parts
 
-        def at(column: int, value: float) -> list[np.ndarray]:
-            if isinstance(present, float):
-                setattr(holder, attribute, value)
-            else:
-                present.reshape(-1)[column] = value
-            return self._step(model, row)
+    def _inputs(
+        self, row: np.ndarray, name: str, width: float
+    ) -> Iterator[tuple[Callable[[float], np.ndarray], float]]:
+        """Give for each entry of an input a function of an amount to the state that it changes so, and a small amount."""
+        place, size = self.places[name], min(width, HAIR) if _moves_gaps(name) else width
+        for entry in range(place.start, place.stop):
+            yield functools.partial(_with_entry, row, entry), size
 
-        for column, value in enumerate(values.tolist()):
-            width = 10 * _WIDTH * abs(value) or _WIDTH
-            above, below = at(column, value + width), at(column, value - width)
-            at(column, value)
-            jacobian[:, column] = _change(model, above, below) / (2 * width)
+    def _numbers(
+        self, model: mujoco.MjModel, row: np.ndarray, name: str
+    ) -> Iterator[tuple[Callable[[float], np.ndarray], float]]:
+        """Give the same for each entry of an array of the model, which changes here and where gaps are measured."""
+        attribute, both = name.removeprefix("opt."), (model, self.surfaces.model)
+        holders = [one.opt for one in both] if name.startswith("opt.") else both
+        present = [np.array(getattr(one, attribute, []), float).reshape(-1) for one in holders]
+        for entry, values in enumerate(np.transpose(present).tolist()):
+            change = functools.partial(_with_number, row, holders, attribute, entry, values)
+            yield change, 10 * _WIDTH * abs(values[0]) or _WIDTH
+
+    def _rates(self, put: Callable[[float], np.ndarray], size: float, events: Events) -> Float[np.ndarray, " modes"]:
+        """Return by how much the modes of events change with what is put."""
+        found = []
+        for amount in (0.0, size, -size):
+            mujoco.mj_setState(self.surfaces.model, self.far, put(amount), _ALL)
+            found.append((amount, *self.surfaces.gaps(self.far)))
+        alike = [(amount, gaps) for amount, owners, gaps in found if owners == found[0][1]]
+        (first, before), (last, after) = alike[-2:] if len(alike) > 1 else 2 * alike
+        change = (after - before) / (last - first if last != first else 1.0)
+        return events.weights @ change[events.index]
 
     def _step(self, model: mujoco.MjModel, row: np.ndarray) -> list[np.ndarray]:
         mujoco.mj_setState(model, self.data, row, _ALL)
@@ -482,6 +510,36 @@ class _Worker:
         return moved
 
 
+def _with_entry(row: np.ndarray, entry: int, amount: float) -> np.ndarray:
+    """Return a state with an entry changed by an amount."""
+    row = row.copy()
+    row[entry] += amount
+    return row
+
+
+def _with_number(
+    row: np.ndarray, models: Iterable, attribute: str, entry: int, values: list[float], amount: float
+) -> np.ndarray:
+    """Change a number of models to their values and an amount; the state is as it was."""
+    for model, value in zip(models, values, strict=True):
+        present = getattr(model, attribute)
+        if isinstance(present, float):
+            setattr(model, attribute, value + amount)
+        else:
+            present.reshape(-1)[entry] = value + amount
+    return row
+
+
+def with_later(wanted: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what is wanted with what events leave to a later step, by the state and by all that moves gaps."""
+    moving = [name for name in wanted if _moves_gaps(name)]
+    return (*wanted, *LATER, *(f"{later} {name}" for later in LATER for name in moving))
+
+
+def _moves_gaps(name: str) -> bool:
+    return name.startswith("mocap") or name not in {*INPUTS, "C", "D", "end"}
+
+
 def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarray]) -> Float[np.ndarray, " size"]:
     """Return one state less another in tangent space."""
     positions = np.zeros(model.nv)
@@ -491,13 +549,22 @@ def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarr
 
 def _through(found: dict[str, np.ndarray], names: list[str]) -> dict[str, np.ndarray]:
     """Return Jacobians of several steps, one after the other; the first is by the state."""
-    own, late = np.concatenate([found[name] for name in names], axis=-1), 0.0
-    size = own.shape[-2]
-    own[..., :size] = 0.0
-    main = end = np.broadcast_to(np.eye(size, own.shape[-1]), own.shape[1:])
+    size = found["state"].shape[-2]
+
+    def beside(later: str) -> np.ndarray:
+        """Return what is added to each step by all but the state, which has no columns of its own here."""
+        parts = [found.get(f"{later}{name}", np.zeros_like(found[name])) for name in names]
+        return np.concatenate([np.zeros_like(parts[0]), *parts[1:]], axis=-1)
+
+    own, *later = beside(""), beside("begun "), beside("late ")
+    late, main = 0.0, np.broadcast_to(np.eye(size, own.shape[-1]), own.shape[1:])
+    end = main
     for t, matrix in enumerate(found["state"]):
         end = matrix @ main + own[t] + late
-        begun, late = (found[name][t] @ main if name in found else 0.0 for name in LATER)
+        begun, late = (
+            (found[name][t] @ main if name in found else 0.0) + extra[t]
+            for name, extra in zip(LATER, later, strict=True)
+        )
         main = end - begun
     widths = np.cumsum([found[name].shape[-1] for name in names])
     return dict(zip(names, np.split(end, widths[:-1], axis=-1), strict=True))

@@ -39,9 +39,11 @@ an event costs four more steps, and a step without any costs nothing.
 - **Small differences** are of one side. Where a gap is smaller than they are, they are taken a little farther off, also for
   "discrete" gradients. Contacts that chatter have such gaps at one step in a hundred. `mjd_transitionFD` crosses the surface
   there, and has entries of 1e5 in place of 1e2.
-- **Reach.** Velocities, activations, controls and parameters do not move gaps within the step: small differences serve them.
-  Events are not spanned by sizes and places, which do move surfaces. Jumps that are no event remain unseen: hit or miss,
-  an edge that catches. Where the phases of a motion do not fill several steps the slope is ill defined.
+- **Sizes and places.** What moves a gap at a rate R (a radius, a mocap body's place, a joint's range) moves the crossing as
+  displacements P R do, and has D R. Its small differences are taken at the same gap, that is with -P R added to the position.
+- **Reach.** Velocities, activations and controls do not move gaps within the step: small differences serve them.
+  Jumps that are no event remain unseen: hit or miss, an edge that catches.
+  Where the phases of a motion do not fill several steps the slope is ill defined.
 
 References:
     Kong, Payne, Zhu, Johnson. Saltation matrices: the essential tool for linearizing hybrid dynamical systems. arXiv:2306.06862.
@@ -53,14 +55,15 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from mjxgrad.bodies import tree
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
 _BOUNCE, _SMALLEST = 10.0, 1e-6  # by how many steps' accelerations contacts bounce, squared (m or rad)
-_HAIR = 6e-5  # m, over which the geometry of contacts is averaged
+HAIR = 6e-5
+"""How far surfaces are moved to average the geometry of contacts (m)."""
 _LARGEST_TURN = 0.02  # rad, of the smallest bodies
 _NOTHING = 1e-30
 _STAGES = 1.2  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
@@ -90,6 +93,8 @@ class Events:
         surfaces: J of the events themselves.
         gaps: their distances less margins at present (m or rad).
         centres: their gaps in the middle; zero, but for steps of several stages (m or rad).
+        weights: of each event in each mode.
+        index: which of all rows they are.
     """
 
     rows: Float[np.ndarray, "modes nv"]
@@ -100,6 +105,8 @@ class Events:
     surfaces: Float[np.ndarray, "events nv"]
     gaps: Float[np.ndarray, " events"]
     centres: Float[np.ndarray, " events"]
+    weights: Float[np.ndarray, "modes events"]
+    index: Int[np.ndarray, " events"]
 
 
 @dataclass(frozen=True)
@@ -126,7 +133,7 @@ class Near:
         """Return by how many times a displacement moves a body's farthest point a hair's breadth, across no surface."""
         crossing = np.abs(self.gaps) / np.maximum(np.abs(self.rows @ change), _NOTHING)
         by_turn = _LARGEST_TURN / np.abs(change).max()
-        return min(_HAIR / np.max(self.lengths * np.abs(change)), by_turn, 0.9 * crossing.min(initial=np.inf))
+        return min(HAIR / np.max(self.lengths * np.abs(change)), by_turn, 0.9 * crossing.min(initial=np.inf))
 
 
 class Surfaces:
@@ -200,33 +207,43 @@ class Surfaces:
         """Return which rows some coordinate moves."""
         return np.linalg.norm(rows / self.lengths, axis=1) > 1 / _FARTHEST
 
+    def gaps(self, data: mujoco.MjData) -> tuple[bytes, _PerRow]:
+        """Return what the rows of contacts and limits belong to, and their gaps, at the position in `data`."""
+        mujoco.mj_fwdPosition(self.model, data)
+        acts, first, limits = self._addresses(data)
+        owners = np.asarray(data.contact.geom).reshape(-1, 2)[acts], data.efc_type[limits], data.efc_id[limits]
+        return b";".join(one.tobytes() for one in owners), self._gaps_at(data, first, limits)
+
+    def _addresses(self, data: mujoco.MjData) -> tuple[_Mask, Int[np.ndarray, " contacts"], Int[np.ndarray, " limits"]]:
+        """Return which contacts act, and the first rows of these and of limits."""
+        first, kinds = np.asarray(data.contact.efc_address), data.efc_type
+        return first >= 0, first[first >= 0], np.flatnonzero((kinds == _LIMITS[0]) | (kinds == _LIMITS[1]))
+
+    def _gaps_at(self, data: mujoco.MjData, first: Int[np.ndarray, " n"], limits: Int[np.ndarray, " m"]) -> _PerRow:
+        reach = np.repeat([self.contact_reach, self.limit_reach], [len(first), len(limits)])
+        address = np.concatenate([first, limits])
+        return data.efc_pos[address] - data.efc_margin[address] + reach
+
     def _gaps(self, data: mujoco.MjData) -> tuple[_Mask, _Rows, _PerRow, _PerRow, _Mask]:
         """Return of contacts and limits whether they are rough, J, gap, least width, and whether force jumps."""
         model, jacobian = self.model, data.efc_J.reshape(-1, self.model.nv)
-        contact = data.contact
-        first = np.asarray(contact.efc_address)
-        acts = first >= 0
-        first, dim = first[acts], np.asarray(contact.dim)[acts]
-        is_pyramid = (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL) & (dim > 1)
+        contact, (acts, first, limits) = data.contact, self._addresses(data)
+        is_pyramid = (model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL) & (np.asarray(contact.dim)[acts] > 1)
         # The first two edges of a pyramid, n + μt and n - μt, have the normal as their mean.
         other = first + is_pyramid
-        kinds = data.efc_type
-        limits = np.flatnonzero((kinds == _LIMITS[0]) | (kinds == _LIMITS[1]))
-        is_joint = kinds[limits] == _LIMITS[0]
+        is_joint = data.efc_type[limits] == _LIMITS[0]
         solimp = [np.asarray(contact.solimp).reshape(-1, 5)[acts]]
         for i, joint in zip(data.efc_id[limits].tolist(), is_joint.tolist(), strict=True):
             solimp.append((model.jnt_solimp if joint else model.tendon_solimp_lim)[i : i + 1])
-        margin = np.concatenate([np.full(len(first), self.contact_reach), np.full(len(limits), self.limit_reach)])
-        address = np.concatenate([first, limits])
         first_impedance, _, width, *_ = np.concatenate(solimp).T
         width = np.where(width > 0, np.minimum(width, _USUAL_WIDTH), _USUAL_WIDTH)
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
-        is_rough = np.zeros(len(address), bool)
+        is_rough = np.zeros(len(rows), bool)
         is_rough[: len(first)] = self.is_rough[np.asarray(contact.geom).reshape(-1, 2)[acts]].any(axis=1)
         return (
             is_rough,
             rows,
-            data.efc_pos[address] - data.efc_margin[address] + margin,
+            self._gaps_at(data, first, limits),
             _LEAST_WIDTH * width,
             first_impedance > _NO_JUMP,
         )
@@ -296,22 +313,23 @@ def _by_modes(
     scaled, index = rows / lengths, np.flatnonzero(chosen)
     moved = ((rows != 0) & is_contact[:, None])[index].astype(float)
     _, group = connected_components(moved @ moved.T, directed=False)
-    back, modes, ahead, values, widest, groups = (centres - gaps)[index], [], [], [], [], []
+    patterns, widest, groups = [], [], []
     for one in range(group.max() + 1):
         own = np.flatnonzero(group == one)
-        patterns, sizes, _ = np.linalg.svd(scaled[index[own]], full_matrices=False)
-        largest = np.abs(patterns).max(axis=0)
-        for weights in (largest * patterns).T[largest * sizes > 1 / _FARTHEST]:
-            modes.append(weights @ scaled[index[own]])
-            ahead.append((weights * times[index[own]]) @ rows[index[own]])
-            values.append(weights @ back[own])
+        left, sizes, _ = np.linalg.svd(scaled[index[own]], full_matrices=False)
+        largest = np.abs(left).max(axis=0)
+        for weights in (largest * left).T[largest * sizes > 1 / _FARTHEST]:
+            patterns.append(np.zeros(len(index)))
+            patterns[-1][own] = weights
             widest.append(widths[index[own]].max())
             groups.append(one)
-    if not modes:
+    if not patterns:
         return None
-    apart = _independent(np.array(modes), np.zeros((0, scaled.shape[1])))
-    mode, label, width = (np.array(x)[apart] for x in (modes, groups, widest))
-    to_middle = np.where(label[:, None] == label, np.array(values)[apart, None], 0.0)
+    every = np.array(patterns)
+    apart = _independent(every @ scaled[index], np.zeros((0, scaled.shape[1])))
+    weights, label, width = every[apart], np.array(groups)[apart], np.array(widest)[apart]
+    mode = weights @ scaled[index]
+    to_middle = np.where(label[:, None] == label, (weights @ (centres - gaps)[index])[:, None], 0.0)
     held = np.zeros(0, int)
     while True:
         kept = held[_independent(scaled[held], mode)]
@@ -325,13 +343,15 @@ def _by_modes(
     by_coordinate = 1 / lengths[:, None]
     return Events(
         mode * lengths,
-        np.array(ahead)[apart],
+        (weights * times[index]) @ rows[index],
         moves * by_coordinate,
         middles * by_coordinate,
         width,
         rows[index],
         gaps[index],
         centres[index],
+        weights,
+        index,
     )
 
 

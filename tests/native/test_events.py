@@ -229,23 +229,64 @@ def test_a_contact_of_two_steps_has_its_slope():
     assert abs(found.mean[0, 1] - found.slope[1]) < 0.3  # a tooth has -20
 
 
+THROWN = """<mujoco><worldbody><body name="bat" mocap="true"><geom name="bat" type="box" size=".2 .2 .02"/></body>
+    <body pos="0 0 .2"><freejoint/><geom name="ball" size=".05" mass="1"/></body>
+    <body pos="2 0 0"><joint name="j" axis="0 1 0" range="-40 40" damping=".01"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03"/></body></worldbody></mujoco>"""
+
+
+def _moved_surface(scene, what):
+    """Return the function from a size or place to where the ball is, or the arm, half way and at the end."""
+    start = mg.initial_state(scene, qvel=jnp.array([0.5, 0.5, -0.5, 0, 5.0, 0, 6.0]))
+    ball, turn = scene.mj_model.geom("ball").id, jnp.array([0.0, 0, 1, 0])
+
+    def outcome(x):
+        one, inputs = scene, {}
+        if what == "radius":
+            one = scene.with_model(geom_size=scene.model.geom_size.at[ball, 0].add(x), body_mass=scene.model.body_mass)
+        elif what == "range":
+            one = scene.with_model(jnt_range=scene.model.jnt_range.at[1, 1].add(x))
+        elif what == "mocap_pos":
+            inputs = {what: jnp.tile(x * jnp.array([0.0, 0, 1]), (120, 1, 1))}
+        else:
+            inputs = {what: jnp.tile(jnp.cos(x / 2) * jnp.array([1.0, 0, 0, 0]) + jnp.sin(x / 2) * turn, (120, 1, 1))}
+        course = mg.rollout(one, start, horizon=120, contact=mg.Slope("mujoco"), inputs=inputs)
+        return course.qpos[jnp.array([80, 120])][:, jnp.array([7] if what == "range" else [0, 2])]
+
+    return outcome
+
+
+@pytest.mark.parametrize(
+    ("what", "reach"), [("radius", 0.01), ("mocap_pos", 0.02), ("mocap_quat", 0.2), ("range", 0.05)]
+)
+def test_what_moves_a_surface_has_the_slope_as_mean(what, reach):
+    """A ball's radius, a bat's place and turn, a joint's range: small differences are off by 0.1 to 0.7."""
+    found = _to_slope(_moved_surface(mg.load_scene(THROWN), what), (-reach, reach), 65)
+    off, slope = np.abs(found.error[0]), np.maximum(np.abs(found.slope), 0.2 * np.abs(found.slope).max())
+    assert (off <= np.maximum(2 * found.standard_error[0], 0.05 * slope)).all(), (found.mean[0], found.slope)
+
+
 def test_several_steps_at_once_are_those_of_a_rollout():
-    """Through a landing that begins in each of them."""
+    """Through a landing that begins in each of them; by the stick's radius, too, of which its mass and inertia are functions."""
     scene = mg.load_scene(STICK)
+    sizes = scene.mj_model.geom_size
     for height in np.linspace(-0.348, -0.356, 7):
         place, speed = np.array([0.0, height, 0.0]), np.array([0.3, -2.0, 0.0])
 
-        def course(qvel, place=place):
+        def course(qvel, radius, place=place):
             start = mg.initial_state(scene, place, qvel)
-            last = mg.rollout(scene, start, horizon=3, contact=mg.Slope("mujoco")).final
+            thicker = scene.with_model(
+                geom_size=jnp.asarray(sizes).at[1, 0].set(radius), body_mass=scene.model.body_mass
+            )
+            last = mg.rollout(thicker, start, horizon=3, contact=mg.Slope("mujoco")).final
             return jnp.concatenate([last.qpos, last.qvel])
 
         state = {"time": np.zeros((1, 1)), "qpos": place[None], "qvel": speed[None], "act": np.zeros((1, 0))}
-        how = {"gradient": "slope", "wanted": ("end",), "num_substeps": 3}
-        found = Engine(scene.mj_model).linearise({}, state, {"ctrl": np.zeros((1, 0))}, **how)
-        np.testing.assert_allclose(
-            found["state"][0, :, 3:], jax.jacrev(course)(jnp.asarray(speed)), rtol=1e-4, atol=1e-5
-        )
+        how = {"gradient": "slope", "wanted": ("geom_size", "end"), "num_substeps": 3}
+        found = Engine(scene.mj_model).linearise({"geom_size": sizes}, state, {"ctrl": np.zeros((1, 0))}, **how)
+        by_speed, by_radius = jax.jacrev(course, (0, 1))(jnp.asarray(speed), jnp.asarray(sizes[1, 0]))
+        np.testing.assert_allclose(found["state"][0, :, 3:], by_speed, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(found["geom_size"][0, :, 3], by_radius, rtol=1e-4, atol=1e-4)
 
 
 def test_a_row_that_would_be_carried_across_zero_is_held():
