@@ -93,7 +93,7 @@ class Events:
         surfaces: J of the events themselves.
         gaps: their distances less margins at present (m or rad).
         centres: their gaps in the middle; zero, but for steps of several stages (m or rad).
-        weights: of each event in each mode.
+        weights: how much each event counts in each mode.
         index: which of all rows they are.
     """
 
