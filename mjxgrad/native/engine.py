@@ -35,7 +35,7 @@ _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") 
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
-_TOLERANCE, _ITERATIONS = 1e-14, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
+_TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 
 _Arrays = Mapping[str, np.ndarray]
 
