@@ -29,7 +29,7 @@ from mjxgrad.scene.conversions import (
     kinematics_alone,
     switch_off,
 )
-from mjxgrad.scene.refusals import REFUSALS, UNLIKE, refusal_messages
+from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 
 _FLOAT32_TOLERANCE = 1e-6
@@ -106,7 +106,7 @@ def load_scene(
     reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [alone])
     messages += [f"C MuJoCo steps it: {reasons}; see scene.unsupported"] if unsupported and engine is None else []
     if not unsupported:
-        messages += [text.partition("; load")[0] for text in refusal_messages(mj_model, [UNLIKE])]
+        messages += [text.partition("; load")[0] for text in refusal_messages(mj_model, [UNLIKE, UNDECIDED])]
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]
     if softness is not None:
         scene = eqx.tree_at(lambda s: s.model, scene, softness.apply(scene.model))

@@ -4,6 +4,7 @@ The table comes from a small scene per feature, stepped in C MuJoCo and in MJX 3
 raise in MJX without naming the element, and many more are ignored.
 """
 
+import copy
 from collections.abc import Callable, Iterable, Iterator
 from enum import IntEnum
 
@@ -21,6 +22,7 @@ _INTEGRATOR = mujoco.mjtIntegrator
 _SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE.value, mujoco.mjtJoint.mjJNT_HINGE.value)
 _SEARCHED = {_GEOM.mjGEOM_ELLIPSOID.value, _GEOM.mjGEOM_CYLINDER.value}
 _CAPSULE = _GEOM.mjGEOM_CAPSULE.value
+_NEAR, _ROUNDING = 1e-6, 1e-9  # m
 _SHAPED = {_GEOM.mjGEOM_MESH.value, _GEOM.mjGEOM_HFIELD.value}
 _SMOOTH = _SEARCHED | {_GEOM.mjGEOM_SPHERE.value, _CAPSULE}
 
@@ -116,6 +118,28 @@ def _has_mesh_margin(model: mujoco.MjModel, pair: ContactPair, kinds: list[int])
     margin = model.geom_margin[[pair.geom1, pair.geom2]].sum()
     margin = model.pair_margin[pair.explicit] if pair.explicit >= 0 else margin
     return bool(margin) and bool(_SHAPED.intersection(kinds))
+
+
+def _undecided(model: mujoco.MjModel) -> list[str]:
+    """Name what touches or not by rounding alone: in the reference pose the gap is zero, and no coordinate moves it."""
+    found: dict[str, None] = {}
+    (far := copy.deepcopy(model)).geom_margin[:] += _NEAR
+    data, rates = mujoco.MjData(far), np.zeros((2, 3, model.nv))
+    mujoco.mj_fwdPosition(far, data)
+    for contact in data.contact:
+        bodies, is_zero = (
+            model.geom_bodyid[contact.geom],
+            abs(contact.dist - contact.includemargin + 2 * _NEAR) < _ROUNDING,
+        )
+        for body, rate in zip(bodies.tolist(), rates, strict=True):
+            mujoco.mj_jac(far, data, rate, None, contact.pos, body)
+        if (
+            is_zero
+            and contact.exclude in (0, 1)
+            and np.abs(contact.frame[:3] @ (rates[1] - rates[0])).max() < _ROUNDING
+        ):
+            found[" with ".join(element_name(model, _OBJECT.mjOBJ_GEOM, geom) for geom in contact.geom.tolist())] = None
+    return list(found)
 
 
 _LAWS = (
@@ -242,6 +266,8 @@ UNLIKE = ("contacts of meshes and height fields like C MuJoCo's", _pairs(lambda 
           "load it with engine='mjx' to have MJX's own")  # fmt: skip
 PARALLEL = ("second contact of capsules that are exactly parallel", _pairs(lambda _, __, kinds: set(kinds) == {_CAPSULE}),
             "C MuJoCo has it")  # fmt: skip
+UNDECIDED = ("rounding like C MuJoCo's, which alone decides whether these touch", _undecided,
+             "lift or sink one of them by a micrometre")  # fmt: skip
 
 
 def refusal_messages(model: mujoco.MjModel, refusals: Iterable[tuple] = REFUSALS) -> list[str]:

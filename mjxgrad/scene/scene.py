@@ -23,7 +23,7 @@ from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
 from mjxgrad.contact.warnings import contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
-from mjxgrad.scene.refusals import PARALLEL, UNLIKE, has_medium, refusal_messages
+from mjxgrad.scene.refusals import PARALLEL, UNDECIDED, UNLIKE, has_medium, refusal_messages
 from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
@@ -179,7 +179,7 @@ class Scene(eqx.Module):
             raise ValueError("summary needs one scene with known values, got a batched or traced one")
         differs = " (moves differently from C MuJoCo)"
         converted = [(c.what, f"{c.given} → {c.used}", c.reason + differs * (not c.exact)) for c in self.conversions]
-        unlike = () if self.unsupported else refusal_messages(self.mj_model, [UNLIKE, PARALLEL])
+        unlike = () if self.unsupported else refusal_messages(self.mj_model, [UNLIKE, UNDECIDED, PARALLEL])
         sections = [
             _heading(self),
             f"Stepped by C MuJoCo: {self.unsupported}" if self.unsupported else "",

@@ -180,6 +180,15 @@ def test_where_mjx_finds_other_contacts_c_mujoco_steps_the_scene_or_the_summary_
     assert said in taken.summary()
 
 
+def test_a_gap_that_rounding_closes_is_warned_of_where_nothing_moves_it():
+    """A ball that slides in the plane that it touches; not one that may leave it."""
+    slides = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/><body pos="0 0 .5">
+      <joint type="slide" axis="1 0 0"/>{}<geom name="ball" size=".5"/></body></worldbody></mujoco>"""
+    with pytest.warns(SceneWarning, match="rounding like C MuJoCo's.* got geom 'floor' with geom 'ball'; lift or sink"):
+        load_scene(slides.format(""))
+    assert "rounding" not in load_scene(slides.format('<joint type="slide" axis="0 0 1"/>')).summary()
+
+
 def test_a_sensor_that_mjx_lacks_is_warned_about_and_the_others_stay():
     sensors = (
         "<sensor><jointpos joint='j'/><e_potential name='energy'/>"
