@@ -124,11 +124,11 @@ class ActorCritic(Method):
 
     def step(self, carry: Learner, index: Int[Array, ""]) -> tuple[Learner, Metrics]:
         """Do one update; its metrics are described in `learn`."""
-        settings, learner, environments = self.settings, carry, carry.environments
+        settings, learner = self.settings, carry
         noise_key, critic_key, next_key = jax.random.split(learner.key, 3)
         first, last = settings.stddev
         stddev = first + (last - first) * learner.num_updates / self.num_updates
-        window, environments, gradients = self._windows(learner, environments, noise_key, stddev)
+        window, environments, gradients = self._windows(learner, noise_key, stddev)
         policy, actor_moments, products, found = self._improve(learner, window, gradients)
         critic, target, critic_moments = learner.critic, learner.target, learner.critic_moments
         critic_loss = jnp.zeros(())
@@ -166,11 +166,11 @@ class ActorCritic(Method):
         return self.environment
 
     def _windows(
-        self, learner: Learner, environments: EnvState, key: PRNGKeyArray, stddev: Float[Array, ""]
+        self, learner: Learner, key: PRNGKeyArray, stddev: Float[Array, ""]
     ) -> tuple[Window, EnvState, Gradients]:
         """Run a window in all environments, on all devices, and differentiate its return."""
         shape = (self.settings.num_environments, self.settings.window, self.environment.num_actions)
-        noise = jax.random.normal(key, shape, environments.obs.dtype)
+        noise = jax.random.normal(key, shape, learner.environments.obs.dtype)
         arrays, structure = eqx.partition(self.environment, eqx.is_array)
 
         def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
@@ -181,7 +181,7 @@ class ActorCritic(Method):
 
         # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
         shared = (arrays, learner.policy.actor, learner.target, learner.normaliser, stddev)
-        return over_devices(one, num_shared=1)(shared, environments, learner.model_keys, noise)
+        return over_devices(one, num_shared=1)(shared, learner.environments, learner.model_keys, noise)
 
     def _improve(
         self, learner: Learner, window: Window, gradients: Gradients
@@ -253,9 +253,8 @@ class ActorCritic(Method):
             value, gradient = jax.value_and_grad(loss)(network, seen[rows], wanted[rows])
             return _stepped(optimiser, gradient, moments, network), value
 
-        orders = jax.vmap(lambda k: jax.random.permutation(k, len(wanted)))(
-            jax.random.split(key, self.settings.critic_iterations)
-        )
+        keys = jax.random.split(key, self.settings.critic_iterations)
+        orders = jax.vmap(lambda k: jax.random.permutation(k, len(wanted)))(keys)
         rows = orders.reshape(self.settings.critic_iterations * self.settings.critic_batches, -1)
         (network, moments), losses = jax.lax.scan(fit, (critic.network, learner.critic_moments), rows)
         critic = ValueFunction(network, critic.moments)

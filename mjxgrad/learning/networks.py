@@ -115,7 +115,5 @@ class ValueFunction(eqx.Module):
         last, share = self.network.layers[-1], self.moments.scale / moments.scale
         shift = (self.moments.mean - moments.mean) / moments.scale
         changed = jax.tree.map(lambda x: (share * x.T).T, last)
-        network = eqx.tree_at(
-            lambda n: n.layers[-1], self.network, eqx.tree_at(lambda n: n.bias, changed, changed.bias + shift)
-        )
-        return ValueFunction(network, moments)
+        changed = eqx.tree_at(lambda n: n.bias, changed, changed.bias + shift)
+        return ValueFunction(eqx.tree_at(lambda n: n.layers[-1], self.network, changed), moments)
