@@ -23,18 +23,19 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 _Info = dict[str, Any]
-_METADATA: _Info = {"render_modes": ["rgb_array"]}
 
 
 class _Adapter:
     """The parts that one copy and many have in common: the environment, its spaces, and pictures of it."""
 
+    metadata: _Info = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
     def _prepare(self, environment: Environment | str, render_mode: str | None, view: _Info) -> None:
         self.environment = load(environment) if isinstance(environment, str) else environment
-        if render_mode not in (None, *_METADATA["render_modes"]):
+        if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f'render_mode must be "rgb_array" or None, got {render_mode!r}')
         self.render_mode, self._view = render_mode, view
-        self.metadata = {**_METADATA, "render_fps": round(1 / float(self.environment.interval))}
+        self.metadata = {**self.metadata, "render_fps": round(1 / float(self.environment.interval))}
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
         super().reset(seed=seed, options=options)
@@ -54,8 +55,6 @@ class _Adapter:
 
 class GymEnv(_Adapter, gymnasium.Env):
     """One copy of an environment, limited by its `episode_length`; `reset` draws what is random in it anew."""
-
-    metadata = _METADATA
 
     def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **view: Any):
         """Prepare an environment, or one of `mjxgrad.envs.ENVIRONMENTS` by name; nothing is compiled before `reset` and `step`.
@@ -90,8 +89,6 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
     A copy whose episode ends starts the next one in the same step: the observation is already the new one. `final_obs` and
     `final_info` hold the last ones of the old episode.
     """
-
-    metadata = _METADATA
 
     def __init__(
         self, environment: Environment | str, num_envs: int = 1, *, render_mode: str | None = None, **view: Any

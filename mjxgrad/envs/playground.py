@@ -57,16 +57,15 @@ def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterat
         ValueError: if contact does not suit `mg.step`.
     """
     check_contact(contact, is_step=True)
-    own_step = functools.partial(_step, iterations, contact=contact)
+
+    def own_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        most = max(iterations, model.opt.iterations)
+        return step(model.replace(opt=model.opt.replace(iterations=most)), data, contact=contact)
+
     # On the object, not in a wrapper: randomisers of models call the step of the innermost environment.
     for name in ("reset", "step"):
         setattr(environment, name, _within(getattr(environment, name), own_step))
     return environment
-
-
-def _step(iterations: int, model: mjx.Model, data: mjx.Data, **settings: Any) -> mjx.Data:
-    most = max(iterations, model.opt.iterations)
-    return step(model.replace(opt=model.opt.replace(iterations=most)), data, **settings)
 
 
 def _within(method: Callable, own_step: Callable[[mjx.Model, mjx.Data], mjx.Data]) -> Callable:
