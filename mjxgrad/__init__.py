@@ -11,16 +11,7 @@ from mjxgrad.diagnostics import check_stability
 from mjxgrad.identification import identify
 from mjxgrad.loop import History, Optimisation, Stopped, estimated_gradient, optimise
 from mjxgrad.objective import Objective, SceneTask, closed_loop, linear_policy, open_loop, parameter_noise
-from mjxgrad.rollouts import (
-    DivergedError,
-    Linearisation,
-    State,
-    Trajectory,
-    initial_state,
-    linearise,
-    render,
-    rollout,
-)
+from mjxgrad.rollouts import DivergedError, Linearisation, State, Trajectory, initial_state, linearise, render, rollout
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.stepping import Discrete, Onset, Slope, Smoothing, contact_force, forward, solve, step
 
