@@ -65,13 +65,6 @@ def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "conta
     return add(terms[:, i : i + 1] for i in range(terms.shape[1]))
 
 
-def gram(left: Float[Array, "rows n *batch"], right: Float[Array, "rows n *batch"]) -> _Matrix:
-    """Return leftᵀ right."""
-    if left.ndim > 2 and len(left) <= LONGEST_SUM:
-        return add(a[:, None] * b[None] for a, b in zip(left, right, strict=True))
-    return jnp.einsum("ri...,rj...->ij...", left, right, precision="highest")
-
-
 def batch_last(function: Callable, batch: int | None = None) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 

@@ -65,12 +65,10 @@ class Angles(eqx.Module):
     chain: "Chains" = eqx.field(static=True)
 
     def quaternions(self, index):
-        half = pick(index, 0.5 * self.angle)
-        fixed = np.where((index >= 0)[:, None], self.chain.quaternion[index], _IDENTITY)
-        turned = np.where((index >= 0)[:, None], self.chain.turned_quaternion[index], 0.0)
-        return maps.scale(jnp.cos(half), jnp.asarray(fixed, half.dtype)) + maps.scale(
-            jnp.sin(half), jnp.asarray(turned, half.dtype)
-        )
+        half, is_turned = pick(index, 0.5 * self.angle), (index >= 0)[:, None]
+        fixed = jnp.asarray(np.where(is_turned, self.chain.quaternion[index], _IDENTITY), half.dtype)
+        turned = jnp.asarray(np.where(is_turned, self.chain.turned_quaternion[index], 0.0), half.dtype)
+        return maps.scale(jnp.cos(half), fixed) + maps.scale(jnp.sin(half), turned)
 
     def compose(self, index, matrices):
         parts = (contract("nij,njk->nik", part, matrices).reshape(-1, 9) for part in self._parts(index))

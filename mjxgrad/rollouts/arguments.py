@@ -26,12 +26,20 @@ def sequence_of(
     controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
 ) -> tuple[Array | None, int]:
     """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
-    sequence = None if controls is None or callable(controls) else real("controls", controls)
-    noise = None if noise is None else real("noise", noise)
-    horizon = _horizon(horizon, controls=sequence, noise=noise)
-    for name, value in (("controls", sequence), ("noise", noise)):
-        if value is None:
-            continue
+    given = {"controls": None if callable(controls) else controls, "noise": noise}
+    given = {name: real(name, value) for name, value in given.items() if value is not None}
+    lengths = {name: len(value) for name, value in given.items() if value.ndim}
+    if horizon is not None:
+        lengths["horizon"] = whole("horizon", horizon)
+    if not lengths:
+        raise ValueError("horizon must be given where neither controls nor noise give it, got None")
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"controls, noise and horizon must agree on the number of steps, got {told}")
+    horizon = next(iter(lengths.values()))
+    if horizon < 1:
+        raise ValueError(f"horizon must be at least 1, got {horizon}")
+    for name, value in given.items():
         if jnp.shape(value) != (horizon, num_controls):
             meaning = "one row per step and one column per actuator"
             is_turned = jnp.ndim(value) == 2 and jnp.shape(value)[0] == num_controls > 1
@@ -42,7 +50,7 @@ def sequence_of(
         if numbers is not None and not np.isfinite(numbers).all():
             row, column = np.argwhere(~np.isfinite(numbers))[0]
             raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")
-    return sequence, horizon
+    return given.get("controls"), horizon
 
 
 def check_start(scene: Any, state: Any) -> None:
@@ -95,18 +103,3 @@ def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:
     if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (count,):
         raise ValueError(f"the policy must return one control per actuator, shape ({count},), got {form(chosen)}")
     return jnp.asarray(chosen)
-
-
-def _horizon(horizon: int | None, **sequences: ArrayLike | None) -> int:
-    lengths = {k: int(jnp.shape(v)[0]) for k, v in sequences.items() if v is not None and jnp.ndim(v)}
-    if horizon is not None:
-        lengths["horizon"] = whole("horizon", horizon)
-    if not lengths:
-        raise ValueError("horizon must be given where neither controls nor noise give it, got None")
-    if len(set(lengths.values())) > 1:
-        given = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise ValueError(f"controls, noise and horizon must agree on the number of steps, got {given}")
-    length = next(iter(lengths.values()))
-    if length < 1:
-        raise ValueError(f"horizon must be at least 1, got {length}")
-    return length

@@ -85,9 +85,8 @@ class SparseRows(eqx.Module):
                 curvature = row_hessian.simple[rows].reshape(*entries.shape[:2], 1, *mass.shape[2:])
                 square = _gram(entries, curvature * entries)
             else:
-                square = _pyramid_square(
-                    row_hessian.simple[rows].reshape(*mu.shape[:2], 2, *mass.shape[2:]), mu, entries
-                )
+                curvature = row_hessian.simple[rows].reshape(*mu.shape[:2], 2, *mass.shape[2:])
+                square = _pyramid_square(curvature, mu, entries)
             total = linear.add_to_block(total, group.dofs, square)
         return total
 
@@ -134,9 +133,8 @@ class SparseRows(eqx.Module):
         first = layout.num_rows - len(dense_rows)  # cones come last
         parts = [dense_rows[: layout.simple_stop - first]]
         for cone, square in zip(layout.cones, row_hessian.cones, strict=True):
-            own = dense_rows[cone.start - first : cone.stop - first].reshape(
-                cone.count, cone.dim, *dense_rows.shape[1:]
-            )
+            own = dense_rows[cone.start - first : cone.stop - first]
+            own = own.reshape(cone.count, cone.dim, *dense_rows.shape[1:])
             both = linear.add(square[:, :, k, None] * own[:, None, k] for k in range(cone.dim))
             parts.append(both.reshape(-1, *dense_rows.shape[1:]))
         return factors, jnp.concatenate(parts), diagonal
@@ -155,7 +153,7 @@ def _keeps_groups(rows: RowMap) -> bool:
 def _gram(left: _Entries, right: _Entries) -> _Square:
     """Return leftᵀ right."""
     if left.ndim == 3 or left.shape[0] * left.shape[1] > linear.LONGEST_SUM:
-        return linear.gram(flat(left), flat(right))
+        return jnp.einsum("ri...,rj...->ij...", flat(left), flat(right), precision="highest")
     return linear.add(a[:, None] * b[None] for a, b in zip(_rows(left), _rows(right), strict=True))
 
 
@@ -188,7 +186,7 @@ def _pyramid_square(
     difference, (normal, tangents) = difference[:, :, None], (entries[:, 0], entries[:, 1:])
     of_normal = linear.add(both[:, k, None] * normal + difference[:, k] * tangents[:, k] for k in range(both.shape[1]))
     of_tangents = difference * normal[:, None] + (friction**2 * both)[:, :, None] * tangents
-    return linear.gram(normal, of_normal) + _gram(tangents, of_tangents)
+    return _gram(normal[:, None], of_normal[:, None]) + _gram(tangents, of_tangents)
 
 
 def _cone_product(layout: RowLayout, row_hessian: RowHessian, rows: slice, entries: _Entries) -> _Entries:

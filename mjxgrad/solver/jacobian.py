@@ -197,9 +197,8 @@ class ContactRows(RowMap):
     def rmv(self, force):
         force = fold(force.reshape(len(self.frame), -1), self.friction)
         num_axes, num_sides = min(self.dim, 3), self.lever.shape[1]
-        force_at_point = jnp.repeat(
-            contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes]), num_sides, axis=0
-        )
+        push = contract("ckx,ck->cx", self.frame[:, :num_axes], force[:, :num_axes])
+        force_at_point = jnp.repeat(push, num_sides, axis=0)
         torque = spatial.cross(self.lever.reshape(-1, 3), force_at_point)
         if self.dim > 3:
             twist = contract("ckx,ck->cx", self.frame[:, : self.dim - 3], force[:, 3:])

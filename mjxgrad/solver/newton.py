@@ -172,7 +172,6 @@ class Problem(eqx.Module):
         return hessian.solve(self.mass, self.jacobian, self.layout, row_hessian, point.gradient)
 
     def is_finite(self, vector: _Vector) -> _Truth:
-        """Return whether all entries of a vector are finite."""
         return jnp.all(jnp.isfinite(vector), axis=0)
 
     def at(self, acceleration: _Vector) -> "Point":

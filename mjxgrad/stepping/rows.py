@@ -297,9 +297,8 @@ def limits(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
         blocks[0] = one_sided(*_ball_limit(model, data, balls), model.dof_invweight0[dofs], balls, *of_joints)
     if joints.size:
         dofs = model.jnt_dofadr[joints]
-        distance, sign = _nearer_end(
-            linear.take(data.qpos, tuple(model.jnt_qposadr[joints].tolist())), model.jnt_range[joints]
-        )
+        position = linear.take(data.qpos, tuple(model.jnt_qposadr[joints].tolist()))
+        distance, sign = _nearer_end(position, model.jnt_range[joints])
         blocks[1] = one_sided(_axis_rows(sign, dofs, model), distance, model.dof_invweight0[dofs], joints, *of_joints)
     if tendons.size:
         distance, sign = _nearer_end(data.ten_length[tendons], model.tendon_range[tendons])
