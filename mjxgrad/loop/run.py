@@ -239,14 +239,10 @@ def _everywhere() -> jax.sharding.Sharding | None:
 
 def _placed(tree: PyTree, sharding: jax.sharding.Sharding | None) -> PyTree:
     """Return the arrays placed by a sharding; unchanged if it is None."""
-
-    def put(x: Array) -> Array:
-        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(put(jax.random.key_data(x)), impl=jax.random.key_impl(x))
-        # From the host: arrays on a device cannot always be sent to another process.
-        return jax.device_put(np.asarray(x), sharding)
-
-    return tree if sharding is None else jax.tree.map(put, tree)
+    if sharding is None:
+        return tree
+    # From the host: arrays on a device cannot always be sent to another process.
+    return jax.tree.map(lambda x: _restored(jax.device_put(_as_numpy(x), sharding), x), tree)
 
 
 def _save(path: Path, tree: PyTree, fingerprint: dict[str, Any]) -> None:
@@ -299,7 +295,7 @@ def _as_numpy(leaf: Any) -> np.ndarray:
     return np.asarray(leaf)
 
 
-def _restored(saved: np.ndarray, like: Any) -> Any:
+def _restored(saved: np.ndarray | Array, like: Any) -> Any:
     if isinstance(like, jax.Array) and jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(like))
     if saved.dtype.kind == "V":  # NumPy's format has no name for bfloat16 and its like
