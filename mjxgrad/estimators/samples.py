@@ -134,8 +134,9 @@ def sample(objective: Objective, params: Vector, key: PRNGKeyArray, plan: Plan, 
         images = [noise, objective.mirror(noise)] if plan.antithetic else [noise]
         if plan.shares_start:
             images.append(objective.redraw(noise, jax.random.fold_in(key, plan.num_units + unit)))
+        drawn, zeros = (ravel_pytree(eqx.filter(x, eqx.is_inexact_array))[0] for x in (noise, zero_noise))
         # In the same batch, so that the rollout is compiled once.
-        return [*images, zero_noise] if plan.zero_noise_per_unit else images, _differ(noise, zero_noise)
+        return [*images, zero_noise] if plan.zero_noise_per_unit else images, (drawn != zeros).any()
 
     def in_order(*members: Array) -> Array:
         # Not -1: the state of a scene without activations has an axis of length zero.
@@ -262,12 +263,6 @@ def _by_parameters(objective: Objective, plan: Plan, params: Vector, noise: PyTr
     else:
         (cost, score), gradient = cost_and_score(params), nothing
     return Differentiated(cost, gradient, score, jnp.full_like(params, jnp.nan), Partial(unchanged))
-
-
-def _differ(one: PyTree, other: PyTree) -> Bool[Array, ""]:
-    """Return whether two draws of noise differ in any floating-point number."""
-    mine, theirs = (ravel_pytree(eqx.filter(noise, eqx.is_inexact_array))[0] for noise in (one, other))
-    return (mine != theirs).any()
 
 
 def all_finite(array: Float[Array, "units ..."]) -> Bool[Array, " units"]:

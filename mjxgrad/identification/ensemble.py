@@ -50,9 +50,7 @@ class Ensemble(NamedTuple):
 
     point: Float[np.ndarray, " dim"]
     points: Float[np.ndarray, "motions dim"]
-    alone: list[
-        tuple[np.ndarray, np.ndarray]
-    ]  # points and changes of the starts of single motions, the best ones first
+    alone: list[tuple[np.ndarray, np.ndarray]]  # points and changes of the starts of single motions, best first
     noise: float  # its size, 1 where it is known
     is_settled: bool
     residual: Float[np.ndarray, " numbers"]  # at the point, over the root of the covariance, times the noise

@@ -186,11 +186,8 @@ class Identification(Printed):
                 "most where contacts chatter."
             )
         if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
-            starts = (
-                ""
-                if self.offsets is not None
-                else "The starts may be noisy: free_start=True (--start free) finds them. "
-            )
+            is_fixed = self.offsets is None
+            starts = "The starts may be noisy: free_start=True (--start free) finds them. " * is_fixed
             found.append(
                 f"Residuals follow one another (correlation {self.correlation:.2f} from one time to the next), so something is "
                 f"not as in the scene. {starts}Values may be off by more than their intervals, which assume independent noise."

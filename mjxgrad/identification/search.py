@@ -277,7 +277,6 @@ class _Program:
         return self._compiled[key](*arguments)
 
     def put(self, scene: Scene, vector: Array) -> Scene:
-        """Return the scene with these values."""
         return write_all(scene, self.parameters, self.coordinates.unravel(vector))
 
     def _residuals(self, vector: Array, offset: Array | None, window: Windows) -> Array:
