@@ -189,11 +189,8 @@ class Knob:
     def __str__(self) -> str:
         kind, model = "actuator" if self.task.num_controls else "joint", self.task.scene.mj_model
         count, first = (model.nu, model.actuator) if kind == "actuator" else (model.njnt, model.joint)
-        mix = (
-            f"({', '.join(f'{x:.3g}' for x in self.direction)})"
-            if len(self.direction) <= _FEW
-            else "of a random direction"
-        )
+        numbers = ", ".join(f"{x:.3g}" for x in self.direction)
+        mix = f"({numbers})" if len(self.direction) <= _FEW else "of a random direction"
         which = first(0).name or f"the {kind}" if count == 1 else f"all {count} {kind}s in a mix {mix}"
         if kind == "joint":
             return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
@@ -308,9 +305,8 @@ def sweep(
     )
     question += f" {told}."
     contact, is_c = task.contact, "mujoco" in (getattr(task.contact, "engine", None), scene.engine)
-    kind = {"slope": "the slope of the outcome", "discrete": "that of each step"}.get(
-        getattr(contact, "gradient", ""), f"{contact}"
-    )
+    kinds = {"slope": "the slope of the outcome", "discrete": "that of each step"}
+    kind = kinds.get(getattr(contact, "gradient", ""), f"{contact}")
     question += f" Derivative: {kind}, by {'C MuJoCo' if is_c else 'MJX'}."
     shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
     if isinstance(contact, Slope) and scene.pairs and swept[-1] >= shortest:

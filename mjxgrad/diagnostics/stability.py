@@ -20,6 +20,7 @@ import jax
 import mujoco
 import numpy as np
 
+from mjxgrad._programs import is_traced
 from mjxgrad._text import Printed, aligned, format_number, format_range, name_pairs
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
@@ -282,8 +283,7 @@ def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityRep
         raise ValueError(f"speed must be positive, got {speed}; leave it out to skip these checks")
     model = scene.model
     leaves = (model.geom_solref, model.jnt_solref, model.opt.timestep)
-    is_traced = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
-    if is_traced or np.ndim(model.geom_solref) != 2 or np.ndim(model.opt.timestep) != 0:
+    if is_traced(leaves) or np.ndim(model.geom_solref) != 2 or np.ndim(model.opt.timestep) != 0:
         raise ValueError("check_stability needs one scene with known values, got a batched or traced one")
     # Inside jit, even operations on known values would be traced.
     with jax.ensure_compile_time_eval():

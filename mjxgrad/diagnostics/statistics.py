@@ -44,9 +44,8 @@ def bootstrap_variance_interval(
 
     settings = {"n_resamples": 1000, "batch": _BATCH, "vectorized": True, "method": "percentile", "rng": 0}
     chosen = (np.arange(len(samples)),)
-    return np.array(
-        stats.bootstrap(chosen, variance, confidence_level=checked(confidence), **settings).confidence_interval
-    )
+    found = stats.bootstrap(chosen, variance, confidence_level=checked(confidence), **settings)
+    return np.array(found.confidence_interval)
 
 
 def checked(confidence: float) -> float:
