@@ -79,13 +79,9 @@ class Angles(eqx.Module):
 
     def _parts(self, index: np.ndarray) -> list[Array]:
         """Return the factors of the cosine and of the sine, and the constant term."""
-        is_turned, nothing = (index >= 0)[:, None, None], np.zeros((3, 3))
-        rests = (nothing, nothing, np.eye(3))
-        parts = (self.chain.even, self.chain.odd, self.chain.constant)
-        return [
-            jnp.asarray(np.where(is_turned, part[index], rest), self.angle.dtype)
-            for part, rest in zip(parts, rests, strict=True)
-        ]
+        is_turned = (index >= 0)[:, None, None]
+        pairs = ((self.chain.even, 0.0), (self.chain.odd, 0.0), (self.chain.constant, np.eye(3)))
+        return [jnp.asarray(np.where(is_turned, part[index], rest), self.angle.dtype) for part, rest in pairs]
 
     def _sum(self, index: np.ndarray, even: Array, odd: Array, constant: Array) -> Array:
         cosine, sine = (pick(index, function(self.angle)) for function in (jnp.cos, jnp.sin))

@@ -100,12 +100,11 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
 
     _, change = jax.jvp(residual, (system, variants), (tangents[0], tangents[1]))
     if device.is_cpu():
-        moved = [response(variants[k], both[k], change[k], needed) for k, needed in enumerate((None, differ))]
-        moved = -jnp.stack(moved)
+        moved = jnp.stack([response(variants[k], both[k], change[k], one) for k, one in enumerate((None, differ))])
     else:
-        moved = -jax.vmap(response)(variants, both, change)
+        moved = jax.vmap(response)(variants, both, change)
     no_change = np.zeros(count.shape, jax.dtypes.float0)
-    return (both, count), (moved, no_change)
+    return (both, count), (-moved, no_change)
 
 
 def solve_linearised(

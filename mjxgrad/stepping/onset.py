@@ -315,16 +315,13 @@ def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_S
     J is None where it is that of the other solve; it differs where contacts act from another side.
     """
     # The first row of a contact or limit represents it in the mean.
-    each = [(np.arange(len(block.residual)), block.rows_each) for block in blocks]
-    is_first = np.concatenate([row % num == 0 if num else np.zeros(len(row), bool) for row, num in each])
+    numbered = [(np.arange(len(block.residual)), block.rows_each) for block in blocks]
+    is_first = np.concatenate([row % num == 0 if num else np.zeros(len(row), bool) for row, num in numbered])
     whole, present = jnp.concatenate(shares), 1.0
     if any(side is not None for side in sides):
-        present = jnp.concatenate(
-            [
-                jnp.ones_like(share) if side is None else jnp.repeat(side.share, block.rows_each)
-                for block, share, side in zip(blocks, shares, sides, strict=True)
-            ]
-        )
+        each = zip(blocks, shares, sides, strict=True)
+        own = [jnp.ones_like(x) if side is None else jnp.repeat(side.share, block.rows_each) for block, x, side in each]
+        present = jnp.concatenate(own)
     share = whole * present
     is_partial = (share > 0) & (share < 1)
     counts = jnp.where(is_partial & is_first, share * (1 - share), 0.0)

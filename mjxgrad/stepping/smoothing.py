@@ -107,7 +107,6 @@ def smoothed(
         has_distance = ~(jnp.any(are(model, contact.geom, CONVEX), axis=1) & (contact.dist >= 1))
     rows, noises, first = [], [], None
     for block in blocks:
-        count = len(block.residual)
         if block.slots is None:
             noise = Noise(jnp.ones_like(block.residual), jnp.zeros_like(block.residual))
         else:
@@ -115,7 +114,7 @@ def smoothed(
             first = start if first is None else first
         rows.append(block)
         noises.append(noise)
-        start += count
+        start += len(block.residual)
     if first is None:
         return blocks, None, layout
     noise = Noise(*(jnp.concatenate([getattr(n, name) for n in noises]) for name in ("spread", "gate")))
