@@ -198,9 +198,10 @@ class BiasVariance(eqx.Module, Printed):
         """Return the table as text, header first; labels name the softnesses in place of their numbers."""
         (title, swept), table = self.knob, self.table()
         names, points = [name for name in ESTIMATES if f"{name}_bias" in table], np.asarray(self.params)
-        has_alpha = "alpha_order" in names
+        has_alpha, is_many = "alpha_order" in names, len(points) > 1
         first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
-        lines = [[title, "at", "truth", f"bias: {first}", *rest, f"variance: {first}", *rest, *["α"] * has_alpha]]
+        heads = [title, *["at"] * is_many, "truth", f"bias: {first}", *rest, f"variance: {first}", *rest]
+        lines = [[*heads, *["α"] * has_alpha]]
         for i, j in np.ndindex(self.cost.shape):
             one = {name: value[i, j] for name, value in table.items()}
             half = {x: f" ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one}
@@ -208,12 +209,9 @@ class BiasVariance(eqx.Module, Printed):
             biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
             label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(self._too_stiff[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
             variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
-            at = " ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)
-            lines.append([label, at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
-        return [
-            [cell for cell, head in zip(line, lines[0], strict=True) if head != "at" or len(points) > 1]
-            for line in lines
-        ]
+            at = [" ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)] * is_many
+            lines.append([label, *at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
+        return lines
 
     def notes(self) -> list[str]:
         """Return sentences that explain the table, and a warning where the time step is too long."""

@@ -189,9 +189,8 @@ class StabilityReport(Printed):
         lines += [f"  {line}" for line in aligned(rows)]
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)
-        return "\n".join(
-            lines + [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
-        )
+        lines += [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
+        return "\n".join(lines)
 
     __str__ = summary
 
