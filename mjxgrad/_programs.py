@@ -102,7 +102,6 @@ def _processor() -> str:
     """Return a short name of the processor with its features, for which programs are compiled."""
     about = Path("/proc/cpuinfo")
     lines = about.read_text().splitlines() if about.is_file() else [platform.processor()]
-    kinds = sorted(
-        {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))} or lines[:1]
-    )
+    wanted = ("model name", "flags", "Features", "CPU part")
+    kinds = sorted({line for line in lines if line.startswith(wanted)} or lines[:1])
     return f"{platform.machine()}-{hashlib.sha256(''.join(kinds).encode()).hexdigest()[:8]}"

@@ -182,10 +182,9 @@ class Optimisation(eqx.Module, Paged):
 
     def as_html(self) -> str:
         """Return the run as a self-contained page; needs `mjxgrad[render]`."""
-        shown = {"cost under noise": self.history.cost, "α": self.history.alpha}
-        drawings = [
-            svg(functools.partial(_over_steps, *one), one[0]) for one in shown.items() if np.isfinite(one[1]).any()
-        ]
+        shown = (("cost under noise", self.history.cost), ("α", self.history.alpha))
+        known = [one for one in shown if np.isfinite(one[1]).any()]
+        drawings = [svg(functools.partial(_over_steps, *one), one[0]) for one in known]
         return page(str(self).partition(":")[0] + ".", "mjxgrad optimise", [Block(text=str(self), drawings=drawings)])
 
 

@@ -108,10 +108,8 @@ def svg(draw: Callable[[], Any], label: str) -> str:
 
     plt.close(plt.figure())  # loads the backend, whose settings the end of the context would undo
     with plt.style.context([STYLE, {"svg.hashsalt": label}]), io.StringIO() as file:
-        figure = draw()
-        figure.savefig(
-            file, format="svg", transparent=True, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        )
+        figure, without = draw(), dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        figure.savefig(file, format="svg", transparent=True, metadata=without)
         plt.close(figure)
         text = file.getvalue().partition("<svg")[2]
     look = "wide" if figure.get_size_inches()[0] > _WIDE else "narrow"
