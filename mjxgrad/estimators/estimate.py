@@ -88,10 +88,9 @@ class GradientEstimate(eqx.Module, Printed):
         pairs = [*zip(*parts, strict=True), (self.objective_mean, self.objective_standard_error)]
         *shown, cost = (f"{format_number(float(x))} ± {format_number(float(error))}" for x, error in pairs)
         head = f"of {size} numbers, of norm {shown[0]}" if is_long else ", ".join(shown)
-        end = (
-            f"{Diagnosis[self.diagnosis]}. α is {float(self.alpha):.3g}: {Reason[self.reason]}. ± is a standard error."
-        )
-        return f"Gradient {head}; cost {cost}; {int(self.num_rollouts)} rollouts: {end}"
+        spent = f"{int(self.num_rollouts)} rollouts: {Diagnosis[self.diagnosis]}"
+        why = f"α is {float(self.alpha):.3g}: {Reason[self.reason]}. ± is a standard error."
+        return f"Gradient {head}; cost {cost}; {spent}. {why}"
 
     @property
     def variance(self) -> Float[Array, "*batch"]:

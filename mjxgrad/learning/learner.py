@@ -212,10 +212,9 @@ class ActorCritic(Method):
         norm = optax.tree.norm(gradient)
         is_finite = jnp.isfinite(norm)
         optimiser, _ = optimisers(self.settings, self.num_updates)
+        old = (policy.actor, learner.actor_moments)
         new = _stepped(optimiser, gradient, learner.actor_moments, policy.actor)
-        actor, moments = jax.tree.map(
-            lambda x, y: jnp.where(is_finite, x, y), new, (policy.actor, learner.actor_moments)
-        )
+        actor, moments = jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), new, old)
         found = {
             "alpha": a / jnp.where(a + b > 0, a + b, 1.0),
             "gradient_norm": norm,

@@ -107,10 +107,8 @@ class Analytic(Smoother):
         resting = [pair for pair in pairs if {pair.geom1, pair.geom2} in touching]
         if not resting:
             return []
-        return [
-            f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then acts at a distance, "
-            "and bodies that should slide or roll hardly move; for planning set their condim to 1"
-        ]
+        told = f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then acts at a distance"
+        return [f"{told}, and bodies that should slide or roll hardly move; for planning set their condim to 1"]
 
 
 class Exact(Analytic):
