@@ -137,12 +137,15 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
 
 def engine_finding(scene: Scene, motions: Motions) -> Finding:
     """Compare a step by MJX, which is compiled, with C MuJoCo's, both solved to rounding, in states of the motions."""
-    if scene.unsupported:
-        try:
-            with warnings.catch_warnings(action="ignore"):
-                scene = load_scene(scene.to_mujoco(), engine="mjx")
-        except SceneError as error:
-            return Finding("engines", f"{error}.")
+    model = scene.to_mujoco()
+    model.opt.iterations, model.opt.ls_iterations = (
+        max(200, x) for x in (model.opt.iterations, model.opt.ls_iterations)
+    )
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            scene = load_scene(model, engine="mjx")
+    except SceneError as error:
+        return Finding("engines", f"{error}.")
     rng, whole = np.random.default_rng(0), np.flatnonzero(motions.bad_steps < 0)
     at = rng.choice(whole, _NUM_COMPARED), rng.integers(motions.controls.shape[1], size=_NUM_COMPARED)
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *(one.tolist() for one in at)))
