@@ -13,7 +13,8 @@ r"""Contacts of boxes and cylinders with planes, balls and capsules, where C MuJ
   $s = a_\perp·(c - p)_\perp / |a_\perp|^2$ is beside the edge's point $p_j + s a_j$; both are clamped. The second ball is farther
   along the axis over the box, at the capsule's end or the box's, whichever comes first: from a face to the far side; from an
   edge over the face at the lower angle; from a corner along an edge within 45°, else the other way over a face. There is none
-  where both ways lead off the box or both into it.
+  where both ways lead off the box or both into it. Where the axis lies exactly along one of the box, rounding decides on that, in
+  C MuJoCo too, and a place may count twice.
 
 References:
     MuJoCo's `engine_collision_box.c` (`mjc_CapsuleBox`) and `engine_collision_primitive.c` (`mjc_PlaneCylinder`), from which the
