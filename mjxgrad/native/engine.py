@@ -33,6 +33,8 @@ _MOTION = _STATE.mjSTATE_QPOS.value | _STATE.mjSTATE_QVEL.value | _STATE.mjSTATE
 _FULL, _ALL = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of parameters as a share of their value
+# How the names of model arrays and inputs end that move surfaces.
+_SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
@@ -537,7 +539,7 @@ def with_later(wanted: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _moves_gaps(name: str) -> bool:
-    return name.startswith("mocap") or name not in {*INPUTS, "C", "D", "end"}
+    return name.endswith(_SHAPES)
 
 
 def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarray]) -> Float[np.ndarray, " size"]:
