@@ -138,9 +138,8 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
 def engine_finding(scene: Scene, motions: Motions) -> Finding:
     """Compare a step by MJX, which is compiled, with C MuJoCo's, both solved to rounding, in states of the motions."""
     model = scene.to_mujoco()
-    model.opt.iterations, model.opt.ls_iterations = (
-        max(200, x) for x in (model.opt.iterations, model.opt.ls_iterations)
-    )
+    model.opt.iterations = max(200, model.opt.iterations)
+    model.opt.ls_iterations = max(200, model.opt.ls_iterations)
     try:
         with warnings.catch_warnings(action="ignore"):
             scene = load_scene(model, engine="mjx")

@@ -122,23 +122,18 @@ def _has_mesh_margin(model: mujoco.MjModel, pair: ContactPair, kinds: list[int])
 
 def _undecided(model: mujoco.MjModel) -> list[str]:
     """Name what touches or not by rounding alone: in the reference pose the gap is zero, and no coordinate moves it."""
-    found: dict[str, None] = {}
-    (far := copy.deepcopy(model)).geom_margin[:] += _NEAR
+    found, far = dict[str, None](), copy.deepcopy(model)
+    far.geom_margin[:] += _NEAR
+    far.pair_margin[:] += 2 * _NEAR
     data, rates = mujoco.MjData(far), np.zeros((2, 3, model.nv))
     mujoco.mj_fwdPosition(far, data)
     for contact in data.contact:
-        bodies, is_zero = (
-            model.geom_bodyid[contact.geom],
-            abs(contact.dist - contact.includemargin + 2 * _NEAR) < _ROUNDING,
-        )
-        for body, rate in zip(bodies.tolist(), rates, strict=True):
-            mujoco.mj_jac(far, data, rate, None, contact.pos, body)
-        if (
-            is_zero
-            and contact.exclude in (0, 1)
-            and np.abs(contact.frame[:3] @ (rates[1] - rates[0])).max() < _ROUNDING
-        ):
-            found[" with ".join(element_name(model, _OBJECT.mjOBJ_GEOM, geom) for geom in contact.geom.tolist())] = None
+        if contact.exclude in (0, 1) and abs(contact.dist - contact.includemargin + 2 * _NEAR) < _ROUNDING:
+            for geom, rate in zip(contact.geom.tolist(), rates, strict=True):
+                mujoco.mj_jac(far, data, rate, None, contact.pos, model.geom_bodyid[geom])
+            if np.abs(contact.frame[:3] @ (rates[1] - rates[0])).max() < _ROUNDING:
+                names = (element_name(model, _OBJECT.mjOBJ_GEOM, geom) for geom in contact.geom.tolist())
+                found[" with ".join(names)] = None
     return list(found)
 
 
