@@ -445,11 +445,11 @@ class _Worker:
     ) -> None:  # fmt: skip
         """Write differences by inputs beside controls and by numbers of the model; what moves gaps has its share of events."""
         for name in (one for one in found if " " not in one and one not in {"state", "ctrl", "C", "D", "end", *LATER}):
-            moves = events.moves if events is not None and _moves_gaps(name) else None
+            asked = events if _moves_gaps(name) else None
             changes = self._inputs(row, name, width) if name in INPUTS else self._numbers(model, row, name)
             for column, (put, size) in enumerate(changes):
-                rates = self._rates(put, size, events) if events is not None and moves is not None else np.zeros(0)
-                shift = moves @ rates if moves is not None else np.zeros(model.nv)
+                rates = np.zeros(0) if asked is None else self._rates(put, size, asked)
+                shift = np.zeros(model.nv) if asked is None else asked.moves @ rates
                 ends = [self._step(model, self._moved(model, put(x), -x * shift)) for x in (size, -size)]
                 put(0.0)
                 found[name][:, column] = _change(model, *ends) / (2 * size)
