@@ -17,7 +17,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native.engine import LATER, Engine, engine_of, with_later
+from mjxgrad.native.engine import PAIRS, Engine, engine_of, with_pairs
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -58,31 +58,35 @@ def roll_out(
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        wanted = with_later(tuple(given)) if gradient == "slope" else tuple(given)
-        jacobians = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=wanted)
-        forced = {part: jnp.zeros((horizon, jacobians["state"].shape[-1]), dtype) for part in ("", *LATER)}
+        wanted = with_pairs(tuple(given)) if gradient == "slope" else tuple(given)
+        found_by = _jacobians(engine, numbers, before, inputs, gradient=gradient, wanted=wanted)
+        forced = {part: jnp.zeros(found_by[part].shape[:2], dtype) for part in ("state", "felt") if part in found_by}
         for part, name in itertools.product(forced, given):
-            if (own := f"{part} {name}".strip()) in jacobians:
+            own = name if part == "state" else f"{part} {name}"
+            if own in found_by:
                 change = given[name].reshape((horizon, -1) if name in by_input else -1).astype(dtype)
-                forced[part] += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", jacobians[own], change)
+                forced[part] += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", found_by[own], change)
         zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
         changes = {k: zero(by_start[k]) for k in found}
         to_tangent = functools.partial(position_change, scene.model, start["qpos"])
         moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
         first = jnp.concatenate([moved, changes["qvel"], changes["act"]])
 
-        def advance(
-            carry: tuple[Array, Array], step: tuple[tuple[Array, Array], ...]
-        ) -> tuple[tuple[Array, Array], Array]:
-            (change, late), ((matrix, force), *later) = carry, step
-            product = functools.partial(jnp.einsum, "sc,c->s", precision="highest")
-            end = product(matrix, change) + late + force
-            begun, late = (product(part, change) + extra for part, extra in later) if later else (0.0, late)
-            return (end - begun, late), end
+        product = functools.partial(jnp.einsum, "rc,c->r", precision="highest")
 
-        names = [("state", ""), *zip(LATER, LATER, strict=True)]
-        steps = tuple((jacobians[name], forced[part]) for name, part in names if name in jacobians)
-        _, course = jax.lax.scan(advance, (first, jnp.zeros_like(first)), steps)
+        def advance(carry: tuple[Array, Array], step: dict[str, Array]) -> tuple[tuple[Array, Array], Array]:
+            (change, kept), rest = carry, 0.0
+            end = product(step["state"], change) + step["by state"]
+            if "felt" in step:
+                held = kept + product(step["felt"], change) + step["by felt"]
+                kept = step["stays"] * held
+                end, rest = end + product(step["apart"], held), product(step["apart"], kept)
+            return (end - rest, kept), end
+
+        steps = {name: found_by[name] for name in ("state", *PAIRS) if name in found_by}
+        steps |= {f"by {name}": x for name, x in forced.items()}
+        none = jnp.zeros_like(steps["stays"][0]) if "stays" in steps else jnp.zeros(())
+        _, course = jax.lax.scan(advance, (first, none), steps)
         nv = scene.model.nv
         parts = jnp.split(course, (nv, 2 * nv), axis=1)
         parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])

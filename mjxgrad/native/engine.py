@@ -12,20 +12,22 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mjxgrad._warnings import collected
 from mjxgrad.native.events import HAIR, Events, Near, Surfaces, clearance, levers_of, undecided
+from mjxgrad.native.pairs import Pair, num_slots, settle
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
 
 INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat")
 """What may be given to each step, in the order in which MuJoCo keeps it."""
 START = ("time", "qpos", "qvel", "act")
-LATER = ("begun", "late")
-"""Of a slope over several steps: what events of a step add to its own end, and in its place to the end of the next.
+PAIRS = ("felt", "apart", "stays")
+"""Of a slope over several steps, with one entry for each pair of motions that is followed: what it feels of a change where it
+begins, how far apart it is after the step, and whether it goes on.
 
-By the state, and as "begun geom_size" by an input or number.
+See `native.pairs`. As "felt geom_size" by an input or number that moves gaps.
 """
 _STATE = mujoco.mjtState
 _USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
@@ -37,6 +39,7 @@ _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of 
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
+_STEPS = 10  # over which a difference of velocities is one of positions
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 
 _Arrays = Mapping[str, np.ndarray]
@@ -138,13 +141,18 @@ class Engine:
             rows = self._rows({k: v.reshape(len(models) * steps, *v.shape[2:]) for k, v in {**start, **inputs}.items()})
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
             sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            kept = with_later(wanted) if gradient == "slope" and num_substeps > 1 else wanted
+            kept = with_pairs(wanted) if gradient == "slope" and num_substeps > 1 else wanted
             shapes, size = self.shapes(kept, sizes).items(), (num_substeps, len(rows))
             found = {k: np.full((*size, *shape), np.nan if k == "end" else 0.0) for k, shape in shapes}
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
             for one in self.workers:
                 one.begin(gradient, is_centred)
-            self._share(lambda one, piece: one.fill(models, speeds, rows, piece, found), len(rows))
+            courses = _Courses(steps, rows, np.full((*size, rows.shape[1]), np.nan), np.zeros(size, bool))
+            self._share(lambda one, piece: one.fill(models, speeds, courses, piece, found), len(rows))
+            if courses.pairs and "apart" in found:
+                by_course = {k: courses.of(v) for k, v in found.items() if k.split()[0] in ("state", *PAIRS)}
+                self._share(lambda one, piece: one.pursue(courses, piece, by_course["state"]), len(courses.pairs))
+                settle(courses.pairs, by_course)
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
         if num_substeps > 1:
             total |= _through(found, ["state", *(name for name in wanted if name != "end")])
@@ -184,8 +192,9 @@ class Engine:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
         own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
-        own |= dict.fromkeys(LATER, (size, size))
-        return {"state": (size, size)} | {k: own[k] if k in own else (size, sizes[k.split()[-1]]) for k in wanted}
+        own |= {"felt": (count := num_slots(model), size), "apart": (size, count), "stays": (count,)}
+        own |= {k: (count if k.startswith("felt") else size, sizes[k.split()[-1]]) for k in wanted if k not in own}
+        return {"state": (size, size)} | {k: own[k] for k in wanted}
 
     def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
         """Do so many things on all threads; each takes its piece of them."""
@@ -227,6 +236,32 @@ class Engine:
         return rows
 
 
+@dataclasses.dataclass
+class _Courses:
+    """Courses of steps, each over the substeps of a row or over the rows of a trajectory, and the pairs that begin there.
+
+    Attributes:
+        num_steps: rows of a trajectory.
+        rows: the states that are given.
+        states: those before each substep of each row, NaN after one that is not finite.
+        has_events: whether it meets an event.
+    """
+
+    num_steps: int
+    rows: Float[np.ndarray, "rows size"]
+    states: Float[np.ndarray, "substeps rows size"]
+    has_events: Bool[np.ndarray, "substeps rows"]
+    pairs: list[Pair] = dataclasses.field(default_factory=list)
+
+    def of(self, value: np.ndarray) -> np.ndarray:
+        """Return an array of substeps and rows by courses and their steps."""
+        return value.swapaxes(0, 1) if len(value) > 1 else value[0].reshape(-1, self.num_steps, *value.shape[2:])
+
+    def place(self, substep: int, row: int) -> tuple[int, int]:
+        """Return which step of which course this is."""
+        return (row, substep) if len(self.states) > 1 else divmod(row, self.num_steps)
+
+
 class _Worker:
     """The steps and Jacobians of one thread, which keeps its data and its copy of a model."""
 
@@ -236,18 +271,41 @@ class _Worker:
         self.gradient = None
 
     @np.errstate(invalid="ignore", over="ignore")
-    def fill(self, models: list, speeds: np.ndarray, rows: np.ndarray, index: list[int], found: dict) -> None:
+    def fill(self, models: list, speeds: np.ndarray, courses: _Courses, index: list[int], found: dict) -> None:
         """Write the Jacobians of chosen rows; rows of one trajectory, which share a model, follow each other."""
-        num_steps = len(rows) // len(models)
         for i in index:
-            self.use(models, i // num_steps, speeds)
-            row = rows[i].copy() if np.isfinite(rows[i]).all() else None
-            last = len(found["state"]) - 1
-            for t in range(last + 1):
-                if row is not None:
-                    following = row if t < last else rows[i + 1] if (i + 1) % num_steps else None
-                    parts = {name: value[t, i] for name, value in found.items()}
-                    row = self._one(self.model, row, parts, following if "late" in parts else None)
+            self.use(models, i // courses.num_steps, speeds)
+            row = courses.rows[i].copy() if np.isfinite(courses.rows[i]).all() else None
+            for t in range(len(courses.states)):
+                if row is None:
+                    break
+                parts = {name: value[t, i] for name, value in found.items()}
+                end, pairs = self._one(self.model, row, parts)
+                courses.states[t, i], courses.has_events[t, i] = row, bool(pairs)
+                for one in pairs:
+                    one.place = courses.place(t, i)
+                courses.pairs.extend(pairs)
+                row = end
+
+    @np.errstate(invalid="ignore", over="ignore")
+    def pursue(
+        self, courses: _Courses, index: list[int], matrices: Float[np.ndarray, "courses steps size size"]
+    ) -> None:
+        """Follow chosen pairs until the motion's derivative takes over, or their course ends."""
+        states, has_events = courses.of(courses.states), courses.of(courses.has_events)
+        for one in (courses.pairs[k] for k in index):
+            number, first = one.place
+            for t in range(first + 1, states.shape[1]):
+                if one.is_over or not np.isfinite(states[number, t]).all():
+                    break
+                expected = None if has_events[number, t] else matrices[number, t] @ one.apart[-1]
+                if not self._goes_on(one, states[number, t], expected):
+                    break
+
+    def _goes_on(self, pair: Pair, row: np.ndarray, expected: np.ndarray | None) -> bool:
+        """Take a step of a pair by the inputs of a state; return whether it is finite."""
+        ends = [self._step(pair.model, self._at(row, end)) for end in pair.ends]
+        return pair.go_on(ends, _change(pair.model, *ends), expected)
 
     def begin(self, gradient: Gradient, is_centred: bool = True) -> None:
         """Take a gradient for what follows."""
@@ -270,58 +328,65 @@ class _Worker:
     @np.errstate(invalid="ignore", over="ignore")
     def follow(self, row: np.ndarray, inputs: dict, change: np.ndarray, pushes: np.ndarray, found: dict) -> None:
         """Write a course, step by step, and what becomes of a change; a state that is no longer finite stays."""
-        plain = self.given
-        row, change, late = row.copy(), change.copy(), np.zeros_like(change)
+        plain, row, nothing = self.given, row.copy(), np.zeros(pushes.shape[1])
+        followed: list[tuple[Pair, float]] = []
         for t, push in enumerate(pushes):
             for name, value in inputs.items():
                 row[self.places[name]] = value[t].reshape(-1)
             ends = self._step(plain, row)
             row[self.places["warmstart"]] = self.data.qacc_warmstart
-            following = row if self.gradient == "slope" else None
-            if following is not None and t + 1 < len(pushes):
-                following = row.copy()
-                for name, value in inputs.items():
-                    following[self.places[name]] = value[t + 1].reshape(-1)
-            model, near, spanned, clear = self._near(self.model, row, ends[1], following)
-            nv, rest, moved, begun = model.nv, change.copy(), late, np.zeros_like(change)
-            late = np.zeros_like(change)
+            model, near, pairs, clear = self._near(self.model, row, ends[1])
+            for one, _ in followed:
+                expected = None if pairs else self._carried(model, near, clear, one.apart[-1], nothing)
+                if not self._goes_on(one, row, expected):
+                    one.apart.append(0 * one.apart[-1])
+            begun = [(one, float(one.felt @ change)) for one in pairs]
+            rest = change.copy()
             if near is not None and near.events is not None:
-                felt = near.events.rows @ change[:nv] + near.events.ahead @ change[nv : 2 * nv]
-                rest[:nv] -= near.events.moves @ felt
-                begun, late = spanned @ felt
-            if near is not None and near.is_rough:
-                moved = moved + self._visibly(model, clear, rest[:nv], near)
-                rest[:nv] = 0.0
-            width = self._width(near) / max(np.abs(rest).max(), np.abs(push).max(initial=0.0), 1e-30)
-            sides = []
-            for side in (width, -width):
-                sides.append(self._moved(model, clear, side * rest))
-                sides[-1][self.places["ctrl"]] += side * push
-            change = moved + self._difference(model, *sides) / (2 * width)
+                rest[: model.nv] -= near.events.moves @ [felt for _, felt in begun]
+            change = self._carried(model, near, clear, rest, push)
+            followed += begun
+            change += sum(felt * one.apart[-1] for one, felt in followed if one.is_over)
+            followed = [(one, felt) for one, felt in followed if not one.is_over]
             row[self.places["time"]] += model.opt.timestep
             for name, end in zip(START[1:], ends, strict=True):
                 row[self.places[name]] = found[name][t] = end
-            found["change"][t] = change + begun
+            found["change"][t] = change + sum(felt * one.apart[-1] for one, felt in followed)
+
+    def _carried(
+        self, model: mujoco.MjModel, near: Near | None, row: np.ndarray, change: np.ndarray, push: np.ndarray
+    ) -> Float[np.ndarray, " size"]:
+        """Return what a step makes of a change that moves no event, and of one of the controls."""
+        nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
+        if near is not None and near.is_rough:
+            moved = self._visibly(model, row, rest[:nv], near)
+            rest[:nv] = 0.0
+        width = self._width(near) / max(np.abs(rest).max(), np.abs(push).max(initial=0.0), 1e-30)
+        sides = []
+        for side in (width, -width):
+            sides.append(self._moved(model, row, side * rest))
+            sides[-1][self.places["ctrl"]] += side * push
+        return moved + self._difference(model, *sides) / (2 * width)
 
     def _one(
-        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], following: np.ndarray | None
-    ) -> np.ndarray | None:
-        """Write the Jacobians of a step, and return the state after it where that is finite."""
+        self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]
+    ) -> tuple[np.ndarray | None, list[Pair]]:
+        """Write the Jacobians of a step, and return the state after it where that is finite, and the pairs of its events."""
         end = np.empty_like(row)
         mujoco.mj_setState(model, self.data, row, _ALL)
         mujoco.mj_step(model, self.data)
         mujoco.mj_getState(model, self.data, end, _ALL)
         if not np.isfinite(end).all():
-            return None
+            return None, []
         if "end" in found:
             mujoco.mj_getState(model, self.data, found["end"], _MOTION)
         row[self.places["warmstart"]] = end[self.places["warmstart"]]
-        model, near, spanned, clear = self._near(model, row, end[self.places["qvel"]], following)
+        model, near, pairs, clear = self._near(model, row, end[self.places["qvel"]])
         events = None if near is None else near.events
         self._differentiate(model, clear, found, self._width(near), self.is_centred or near is not None)
-        self._by_others(model, clear, found, self._width(near), events, spanned)
+        self._by_others(model, clear, found, self._width(near), events, pairs)
         if near is None:
-            return end
+            return end, pairs
         matrix, nv, rest = found["state"], model.nv, np.eye(model.nv)
         if events is not None:
             rest -= events.moves @ events.rows
@@ -330,13 +395,10 @@ class _Worker:
             matrix[:, :nv] = np.transpose([self._visibly(model, clear, change, near) for change in rest.T])
         elif events is not None:
             matrix[:, :nv] = matrix[:, :nv] @ rest
-        if events is not None:
-            felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, model.na)))
-            begun = spanned[0] @ felt
-            matrix += begun
-            if following is not None:
-                found["begun"][:], found["late"][:] = begun, spanned[1] @ felt
-        return end
+        if "apart" not in found:  # nobody follows them
+            for one in pairs:
+                matrix += np.outer(one.apart[0], one.felt)
+        return end, pairs
 
     def _visibly(
         self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray, near: Near
@@ -361,10 +423,10 @@ class _Worker:
         return _WIDTH if near is None or not near.is_rough or self.surfaces.lead else _RUBBING
 
     def _near(
-        self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray, following: np.ndarray | None
-    ) -> tuple[mujoco.MjModel, Near | None, np.ndarray, np.ndarray]:
-        """Return the model to take differences of, what is near, D₁ and D₂, and the state about which none crosses a surface."""
-        near, nothing, shift, is_undecided = None, np.zeros((0, 0)), None, False
+        self, model: mujoco.MjModel, row: np.ndarray, after: np.ndarray
+    ) -> tuple[mujoco.MjModel, Near | None, list[Pair], np.ndarray]:
+        """Return the model to take differences of, what is near, its pairs, and the state about which none crosses a surface."""
+        near, shift, is_undecided = None, None, False
         if np.isfinite(after).all():
             mujoco.mj_setState(self.surfaces.model, self.far, row, _ALL)
             if self.gradient == "slope":
@@ -375,15 +437,25 @@ class _Worker:
         if is_undecided:
             model = min(undecided(model), key=lambda one: np.abs(self._step(one, row)[1] - after).max())
         if near is None or near.events is None:
-            return model, near, nothing, row if shift is None else self._moved(model, row, shift)
-        spanned = self._spanned(model, row, events := near.events, following)
-        if not np.isfinite(spanned).all():  # a step from beside this state may end nowhere
-            return model, dataclasses.replace(near, events=None), nothing, row
+            return model, near, [], row if shift is None else self._moved(model, row, shift)
+        pairs = self._begun(model, row, events := near.events)
+        if not np.isfinite([one.apart for one in pairs]).all():  # a step from beside this state may end nowhere
+            return model, dataclasses.replace(near, events=None), [], row
         clear = self._moved(model, row, clearance(_WIDTH, events.surfaces, events.gaps, events.centres))
         if self.surfaces.lead:
             for move, rates in zip(events.moves.T, events.rows, strict=True):
                 clear = self._off_stages(model, clear, _WIDTH * np.abs(rates).max() * move)
-        return model, near, spanned, clear
+        return model, near, pairs, clear
+
+    def _begun(self, model: mujoco.MjModel, row: np.ndarray, events: Events) -> list[Pair]:
+        """Return the two motions that span each event, after one step."""
+        found, felt = [], np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, model.na)))
+        lengths = self.surfaces.lengths
+        scale = np.concatenate([lengths, _STEPS * model.opt.timestep * lengths, np.zeros(model.na)])
+        for middle, width, move, own in zip(events.middles.T, events.widths, events.moves.T, felt, strict=True):
+            ends = [self._step(model, self._moved(model, row, middle + side * width * move)) for side in (1, -1)]
+            found.append(Pair(model, ends, 2 * width, own, scale, [_change(model, *ends) / (2 * width)]))
+        return found
 
     def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.
@@ -396,19 +468,6 @@ class _Worker:
                 break
             row = self._moved(model, row, 8 * change)
         return row
-
-    def _spanned(
-        self, model: mujoco.MjModel, row: np.ndarray, events: Events, following: np.ndarray | None
-    ) -> Float[np.ndarray, "steps size events"]:
-        """Return D₁, the differences that span each event, and D₂ after a further step, by whose inputs it is."""
-        columns = []
-        for middle, width, move in zip(events.middles.T, events.widths, events.moves.T, strict=True):
-            ends = [self._step(model, self._moved(model, row, middle + side * width * move)) for side in (1, -1)]
-            column = [_change(model, *ends)]
-            if following is not None:
-                column.append(_change(model, *(self._step(model, self._at(following, end)) for end in ends)))
-            columns.append(np.divide(column, 2 * width))
-        return np.transpose(columns, (1, 2, 0))
 
     def _at(self, row: np.ndarray, end: list[np.ndarray]) -> np.ndarray:
         """Return a whole state with position, velocity and activation of another."""
@@ -441,23 +500,26 @@ class _Worker:
 
     def _by_others(
         self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, events: Events | None,
-        spanned: np.ndarray,
+        pairs: list[Pair],
     ) -> None:  # fmt: skip
         """Write differences by inputs beside controls and by numbers of the model; what moves gaps has its share of events."""
-        for name in (one for one in found if " " not in one and one not in {"state", "ctrl", "C", "D", "end", *LATER}):
+        for name in (one for one in found if " " not in one and one not in {"state", "ctrl", "C", "D", "end", *PAIRS}):
             asked = events if _moves_gaps(name) else None
             changes = self._inputs(row, name, width) if name in INPUTS else self._numbers(model, row, name)
+            shares = np.zeros((len(pairs), found[name].shape[1]))
             for column, (put, size) in enumerate(changes):
-                rates = np.zeros(0) if asked is None else self._rates(put, size, asked)
-                shift = np.zeros(model.nv) if asked is None else asked.moves @ rates
+                shift = np.zeros(model.nv)
+                if asked is not None:
+                    shares[:, column] = self._rates(put, size, asked)
+                    shift = asked.moves @ shares[:, column]
                 ends = [self._step(model, self._moved(model, put(x), -x * shift)) for x in (size, -size)]
                 put(0.0)
                 found[name][:, column] = _change(model, *ends) / (2 * size)
-                if rates.any():
-                    parts = spanned @ rates
-                    found[name][:, column] += parts[0]
-                    if len(parts) > 1:
-                        found[f"begun {name}"][:, column], found[f"late {name}"][:, column] = parts
+            for one, share in zip(pairs, shares, strict=True):
+                if f"felt {name}" in found:
+                    one.by_others[name] = share
+                elif asked is not None:
+                    found[name] += np.outer(one.apart[0], share)
 
     def _inputs(
         self, row: np.ndarray, name: str, width: float
@@ -532,10 +594,9 @@ def _with_number(
     return row
 
 
-def with_later(wanted: tuple[str, ...]) -> tuple[str, ...]:
-    """Return what is wanted with what events leave to a later step, by the state and by all that moves gaps."""
-    moving = [name for name in wanted if _moves_gaps(name)]
-    return (*wanted, *LATER, *(f"{later} {name}" for later in LATER for name in moving))
+def with_pairs(wanted: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what is wanted with what tells of pairs: by the state, and what they feel of all that moves gaps."""
+    return (*wanted, *PAIRS, *(f"felt {name}" for name in wanted if _moves_gaps(name)))
 
 
 def _moves_gaps(name: str) -> bool:
@@ -551,22 +612,24 @@ def _change(model: mujoco.MjModel, above: list[np.ndarray], below: list[np.ndarr
 
 def _through(found: dict[str, np.ndarray], names: list[str]) -> dict[str, np.ndarray]:
     """Return Jacobians of several steps, one after the other; the first is by the state."""
-    size = found["state"].shape[-2]
+    size, sizes = found["state"].shape[-2], [found[name].shape[-1] for name in names]
 
-    def beside(later: str) -> np.ndarray:
+    def beside(kind: str, rows: int) -> np.ndarray:
         """Return what is added to each step by all but the state, which has no columns of its own here."""
-        parts = [found.get(f"{later}{name}", np.zeros_like(found[name])) for name in names]
-        return np.concatenate([np.zeros_like(parts[0]), *parts[1:]], axis=-1)
+        shape = (*found["state"].shape[:-2], rows)
+        own = [found.get(f"{kind}{k}", np.zeros((*shape, n))) for k, n in zip(names, sizes, strict=True)]
+        return np.concatenate([np.zeros((*shape, size)), *own[1:]], axis=-1)
 
-    own, *later = beside(""), beside("begun "), beside("late ")
-    late, main = 0.0, np.broadcast_to(np.eye(size, own.shape[-1]), own.shape[1:])
-    end = main
+    own, kept = beside("", size), 0.0
+    felt = beside("felt ", found["felt"].shape[-2]) if "felt" in found else None
+    end = main = np.broadcast_to(np.eye(size, sum(sizes)), (*found["state"].shape[1:-1], sum(sizes)))
     for t, matrix in enumerate(found["state"]):
-        end = matrix @ main + own[t] + late
-        begun, late = (
-            (found[name][t] @ main if name in found else 0.0) + extra[t]
-            for name, extra in zip(LATER, later, strict=True)
-        )
-        main = end - begun
-    widths = np.cumsum([found[name].shape[-1] for name in names])
-    return dict(zip(names, np.split(end, widths[:-1], axis=-1), strict=True))
+        end = matrix @ main + own[t]
+        if felt is not None:
+            held = found["felt"][t] @ main + felt[t] + kept
+            kept = found["stays"][t][..., None] * held
+            end = end + found["apart"][t] @ held
+            main = end - found["apart"][t] @ kept
+        else:
+            main = end
+    return dict(zip(names, np.split(end, np.cumsum(sizes)[:-1], axis=-1), strict=True))
