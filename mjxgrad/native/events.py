@@ -61,7 +61,7 @@ from scipy.sparse.csgraph import connected_components
 from mjxgrad.bodies import tree
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
-_BOUNCE, _SMALLEST = 10.0, 1e-6  # by how many steps' accelerations contacts bounce, squared (m or rad)
+_BOUNCE, _SMALLEST = 1.0, 1e-6  # by how many steps' accelerations contacts bounce, squared (m or rad)
 HAIR = 6e-5
 """How far surfaces are moved to average the geometry of contacts (m)."""
 _LARGEST_TURN = 0.02  # rad, of the smallest bodies
