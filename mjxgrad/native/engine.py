@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mjxgrad._warnings import collected
 from mjxgrad.native.events import HAIR, Events, Near, Surfaces, clearance, levers_of, undecided
@@ -39,7 +39,7 @@ _WIDTH = 1e-6  # of small differences, as MuJoCo's own documentation has it; of 
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
-# Tangents of a capsule turn at once where it leans by 60°. A contact of two time steps, the shortest, is as steep as 1/4 step.
+# Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
 _STEEP, _NARROWER = 10.0, 1 / 30
 _STEPS = 10  # over which a difference of velocities is one of positions
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
@@ -149,12 +149,15 @@ class Engine:
             speeds = start["qvel"] if num_substeps == 1 else self._reached(start["qvel"], num_substeps)
             for one in self.workers:
                 one.begin(gradient, is_centred)
-            courses = _Courses(steps, rows, np.full((*size, rows.shape[1]), np.nan), np.zeros(size, bool))
+            courses = _Courses(steps, rows, np.full((*size, rows.shape[1]), np.nan))
             self._share(lambda one, piece: one.fill(models, speeds, courses, piece, found), len(rows))
             if courses.pairs and "apart" in found:
                 by_course = {k: courses.of(v) for k, v in found.items() if k.split()[0] in ("state", *PAIRS)}
-                self._share(lambda one, piece: one.pursue(courses, piece, by_course["state"]), len(courses.pairs))
-                settle(courses.pairs, by_course)
+                pairs = [one for begun in courses.pairs.values() for one in begun]
+                self._share(
+                    lambda one, piece: one.pursue(courses, [pairs[k] for k in piece], by_course["state"]), len(pairs)
+                )
+                settle(pairs, by_course)
         total = {name: value[-1 if name == "end" else 0] for name, value in found.items()}
         if num_substeps > 1:
             total |= _through(found, ["state", *(name for name in wanted if name != "end")])
@@ -246,14 +249,13 @@ class _Courses:
         num_steps: rows of a trajectory.
         rows: the states that are given.
         states: those before each substep of each row, NaN after one that is not finite.
-        has_events: whether it meets an event.
+        pairs: those that begin in a step, by its place.
     """
 
     num_steps: int
     rows: Float[np.ndarray, "rows size"]
     states: Float[np.ndarray, "substeps rows size"]
-    has_events: Bool[np.ndarray, "substeps rows"]
-    pairs: list[Pair] = dataclasses.field(default_factory=list)
+    pairs: dict[tuple[int, int], list[Pair]] = dataclasses.field(default_factory=dict)
 
     def of(self, value: np.ndarray) -> np.ndarray:
         """Return an array of substeps and rows by courses and their steps."""
@@ -283,28 +285,29 @@ class _Worker:
                     break
                 parts = {name: value[t, i] for name, value in found.items()}
                 end, pairs = self._one(self.model, row, parts)
-                courses.states[t, i], courses.has_events[t, i] = row, bool(pairs)
+                courses.states[t, i] = row
                 for one in pairs:
                     one.place = courses.place(t, i)
-                courses.pairs.extend(pairs)
+                    courses.pairs[one.place] = pairs
                 row = end
 
     @np.errstate(invalid="ignore", over="ignore")
     def pursue(
-        self, courses: _Courses, index: list[int], matrices: Float[np.ndarray, "courses steps size size"]
+        self, courses: _Courses, pairs: list[Pair], matrices: Float[np.ndarray, "courses steps size size"]
     ) -> None:
-        """Follow chosen pairs until the motion's derivative takes over, or their course ends."""
-        states, has_events = courses.of(courses.states), courses.of(courses.has_events)
-        for one in (courses.pairs[k] for k in index):
+        """Follow pairs until the motion's derivative takes over, or their course ends."""
+        states = courses.of(courses.states)
+        for one in pairs:
             number, first = one.place
             for t in range(first + 1, states.shape[1]):
                 if one.is_over or not np.isfinite(states[number, t]).all():
                     break
-                expected = None if has_events[number, t] else matrices[number, t] @ one.apart[-1]
+                change, begun = one.apart[-1], courses.pairs.get((number, t), ())
+                expected = matrices[number, t] @ change + sum(other.apart[0] * (other.felt @ change) for other in begun)
                 if not self._goes_on(one, states[number, t], expected):
                     break
 
-    def _goes_on(self, pair: Pair, row: np.ndarray, expected: np.ndarray | None) -> bool:
+    def _goes_on(self, pair: Pair, row: np.ndarray, expected: Float[np.ndarray, " size"]) -> bool:
         """Take a step of a pair by the inputs of a state; return whether it is finite."""
         ends = [self._step(pair.model, self._at(row, end)) for end in pair.ends]
         return pair.go_on(ends, _change(pair.model, *ends), expected)
@@ -339,14 +342,12 @@ class _Worker:
             row[self.places["warmstart"]] = self.data.qacc_warmstart
             model, near, pairs, clear = self._near(self.model, row, ends[1])
             for one, _ in followed:
-                expected = None if pairs else self._carried(model, near, clear, one.apart[-1], nothing)
-                if not self._goes_on(one, row, expected):
+                ahead, felt = self._carried(model, near, pairs, clear, one.apart[-1], nothing)
+                ahead += sum(felt * other.apart[0] for other, felt in zip(pairs, felt, strict=True))
+                if not self._goes_on(one, row, ahead):
                     one.apart.append(0 * one.apart[-1])
-            begun = [(one, float(one.felt @ change)) for one in pairs]
-            rest = change.copy()
-            if near is not None and near.events is not None:
-                rest[: model.nv] -= near.events.moves @ [felt for _, felt in begun]
-            change = self._carried(model, near, clear, rest, push)
+            change, felt = self._carried(model, near, pairs, clear, change, push)
+            begun = list(zip(pairs, felt, strict=True))
             followed += begun
             change += sum(felt * one.apart[-1] for one, felt in followed if one.is_over)
             followed = [(one, felt) for one, felt in followed if not one.is_over]
@@ -356,10 +357,13 @@ class _Worker:
             found["change"][t] = change + sum(felt * one.apart[-1] for one, felt in followed)
 
     def _carried(
-        self, model: mujoco.MjModel, near: Near | None, row: np.ndarray, change: np.ndarray, push: np.ndarray
-    ) -> Float[np.ndarray, " size"]:
-        """Return what a step makes of a change that moves no event, and of one of the controls."""
-        nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
+        self, model: mujoco.MjModel, near: Near | None, pairs: list[Pair], row: np.ndarray, change: np.ndarray,
+        push: np.ndarray,
+    ) -> tuple[Float[np.ndarray, " size"], list[float]]:  # fmt: skip
+        """Return what a step makes of a change and of one of the controls, without events, and what each event feels."""
+        nv, rest, moved, felt = model.nv, change.copy(), np.zeros_like(change), [one.felt @ change for one in pairs]
+        if near is not None and near.events is not None:
+            rest[:nv] -= near.events.moves @ felt
         if near is not None and near.is_rough:
             moved = self._visibly(model, row, rest[:nv], near)
             rest[:nv] = 0.0
@@ -368,7 +372,7 @@ class _Worker:
         for side in (width, -width):
             sides.append(self._moved(model, row, side * rest))
             sides[-1][self.places["ctrl"]] += side * push
-        return moved + self._difference(model, *sides) / (2 * width)
+        return moved + self._difference(model, *sides) / (2 * width), felt
 
     def _one(
         self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray]
@@ -481,7 +485,7 @@ class _Worker:
     def _differentiate(
         self, model: mujoco.MjModel, row: np.ndarray, found: dict[str, np.ndarray], width: float, is_centred: bool
     ) -> None:
-        """Write differences of this width by all that is wanted; narrower ones, where these step over a jump of the geometry."""
+        """Write differences of this width by all that is wanted; narrower ones, where these step over a jump."""
         self._subtract(model, row, found, width, is_centred)
         if self._steepness(found["state"]) > _STEEP / model.opt.timestep:
             narrow = {name: found[name].copy() for name in ("state", "ctrl", "C", "D") if name in found}

@@ -2,11 +2,11 @@ r"""Two motions from either side of an event, followed until the derivative alon
 
 A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
 steps both have been, and differ little. Between, the outcome's change is D_j L x, with D_j the difference of the two motions
-after j steps over their distance before. It joins the change along the motion, x, once D_{j+1} = A D_j to a tenth over five
-steps in a row, A the derivative of the motion's own steps, of which none may meet an event.
+after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a tenth, in five steps in
+a row, A the derivative of each of these along the motion with its own events as they are after one step; or after thirty steps.
 
-A contact that lands is over in two steps. One that chatters goes on for as long as it would be multiplied at each of its events:
-the derivative of a difference grows, the difference itself does not.
+A landing is over after six steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
+a difference of two motions is not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 # With three or four alike steps in a row a ball's rolling contact was let go too early, and scattered up to forty times as far.
 _NUM_ALIKE, _ALIKE, _LONGEST = 5, 0.1, 30
-_FEWEST_SLOTS = 12
+_FEWEST_SLOTS = 24
 
 End = Sequence[np.ndarray]
 """Position, velocity and activation."""
@@ -56,34 +56,37 @@ class Pair:
         """Whether the motion's derivative may take over."""
         return self.num_alike >= _NUM_ALIKE or len(self.apart) >= _LONGEST
 
+    def size(self, step: int) -> float:
+        """Return how far apart both are before a step of the course, infinite where they begin."""
+        past = step - self.place[1]
+        return np.linalg.norm(self.scale * self.apart[past - 1]).item() if past else np.inf
+
     def go_on(
         self,
         ends: Sequence[End],
         difference: Float[np.ndarray, " size"],
-        expected: Float[np.ndarray, " size"] | None,
+        expected: Float[np.ndarray, " size"],
     ) -> bool:
-        """Take where both are after a further step; return whether that is finite. None is expected of one with an event."""
+        """Take where both are after a further step, and what the motion's derivative expects; return whether it is finite."""
         apart = difference / self.distance
         if not np.isfinite(apart).all():
             return False
         self.ends = ends
         self.apart.append(apart)
-        size, off = np.linalg.norm(self.scale * apart), np.inf
-        if expected is not None:
-            off = np.linalg.norm(self.scale * (apart - expected))
+        off, size = (np.linalg.norm(self.scale * x) for x in (apart - expected, apart))
         self.num_alike = self.num_alike + 1 if off <= _ALIKE * size else 0
         return True
 
 
 def num_slots(model: mujoco.MjModel) -> int:
     """Return how many pairs of a motion are followed at a time; a step begins no more than there are velocities."""
-    return max(model.nv, _FEWEST_SLOTS)
+    return max(2 * model.nv, _FEWEST_SLOTS)
 
 
 def settle(pairs: Sequence[Pair], found: Mapping[str, np.ndarray]) -> None:
     """Give pairs their slots, and write what each feels, how far it is apart and whether it goes on.
 
-    Where slots lack, the pair that has been followed longest is let go.
+    Where slots lack, the pair that is least apart is let go.
 
     Args:
         pairs: those of all courses.
@@ -97,7 +100,7 @@ def settle(pairs: Sequence[Pair], found: Mapping[str, np.ndarray]) -> None:
             holder = {slot: one for slot, one in holder.items() if one.place[1] + len(one.apart) > now}
             for one in begun:
                 free = [slot for slot in slots if slot not in holder]
-                slot = free[0] if free else min(holder, key=lambda k: holder[k].place)
+                slot = free[0] if free else min(holder, key=lambda k: holder[k].size(now))
                 if not free:
                     del holder[slot].apart[now - holder[slot].place[1] :]
                 holder[slot] = one
