@@ -2,10 +2,10 @@ r"""Two motions from either side of an event, followed until the derivative alon
 
 A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
 steps both have been, and differ little. Between, the outcome's change is D_j L x, with D_j the difference of the two motions
-after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a tenth, in five steps in
-a row, A the derivative of each of these along the motion with its own events as they are after one step; or after thirty steps.
+after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a tenth, in three steps
+in a row, A the derivative of each of these along the motion, its events as they are after one step; or after thirty steps.
 
-A landing is over after six steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
+A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
 a difference of two motions is not.
 """
 
@@ -17,8 +17,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-# With three or four alike steps in a row a ball's rolling contact was let go too early, and scattered up to forty times as far.
-_NUM_ALIKE, _ALIKE, _LONGEST = 5, 0.1, 30
+# Let go after one step that is alike, a rolling ball's derivatives scatter twice as far. Of a falling arm that bounces twice,
+# four keep both motions until the second bounce, which then is not averaged over its own phases.
+_NUM_ALIKE, _ALIKE, _LONGEST = 3, 0.1, 30
 _FEWEST_SLOTS = 24
 
 End = Sequence[np.ndarray]
