@@ -460,7 +460,9 @@ class _Worker:
         scale = np.concatenate([lengths, _STEPS * model.opt.timestep * lengths, np.zeros(model.na)])
         for middle, width, move, own in zip(events.middles.T, events.widths, events.moves.T, felt, strict=True):
             ends = [self._step(model, self._moved(model, row, middle + side * width * move)) for side in (1, -1)]
-            found.append(Pair(model, ends, 2 * width, own, scale, [_change(model, *ends) / (2 * width)]))
+            pair = Pair(model, ends, 2 * width, own, scale, [_change(model, *ends) / (2 * width)])
+            pair.longest = 2 if self.surfaces.lead else pair.longest
+            found.append(pair)
         return found
 
     def _off_stages(self, model: mujoco.MjModel, row: np.ndarray, change: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 # Let go after one step that is alike, a rolling ball's derivatives scatter twice as far. Of a falling arm that bounces twice,
 # four keep both motions until the second bounce, which then is not averaged over its own phases.
-_NUM_ALIKE, _ALIKE, _LONGEST = 3, 0.1, 30
+_NUM_ALIKE, _ALIKE = 3, 0.1
 _FEWEST_SLOTS = 24
 
 End = Sequence[np.ndarray]
@@ -39,6 +39,7 @@ class Pair:
         apart: how far apart they are after each step, over the distance.
         place: which course, and which of its steps, the event is in.
         by_others: `felt`, by each entry of what else moves gaps.
+        longest: after how many steps they are let go in any case.
         num_alike: how many steps in a row the motion's derivative has explained.
     """
 
@@ -50,12 +51,13 @@ class Pair:
     apart: list[Float[np.ndarray, " size"]]
     place: tuple[int, int] = (0, 0)
     by_others: dict[str, np.ndarray] = field(default_factory=dict)
+    longest: int = 30
     num_alike: int = 0
 
     @property
     def is_over(self) -> bool:
         """Whether the motion's derivative may take over."""
-        return self.num_alike >= _NUM_ALIKE or len(self.apart) >= _LONGEST
+        return self.num_alike >= _NUM_ALIKE or len(self.apart) >= self.longest
 
     def size(self, step: int) -> float:
         """Return how far apart both are before a step of the course, infinite where they begin."""

@@ -167,14 +167,13 @@ def test_force_that_begins_without_a_jump_is_no_event():
 
 
 def test_a_runge_kutta_step_spans_all_of_its_stages():
-    """They meet the surface at gaps of 0, 2 and 4 mm, at 2 m/s and 2 ms; the window reaches from 0.1 to 4.1 mm."""
+    """They meet the surface at gaps of 0, 2 and 4 mm, at 2 m/s and 2 ms; the window reaches from -0.4 to 4.4 mm."""
     ball = BALL.format(h=0.002).replace("<option", '<option integrator="RK4"')
-    for gap, is_event in ((0.12e-3, True), (4.08e-3, True), (0.08e-3, False), (4.12e-3, False)):
-        assert (_events(ball, [gap - 0.1], [-2.0], free=0.0) is not None) == is_event
+    for gap, is_event in ((-0.3e-3, True), (4.3e-3, True), (-0.5e-3, False), (4.5e-3, False)):
+        assert (_events(ball, [gap - 0.1], [-2.0]) is not None) == is_event
     found = _compared(mg.load_scene(ball), 0, (0.0, 0.03), 120, [-2.0], read=1)
     off, error = abs(found.mean[0, 1] - found.slope[1]), found.standard_error[0, 1]
-    print(off, error, found.spread[0, 1], found.slope[1])
-    assert off < 2 * error + 0.03  # of -2.6, which a tooth has
+    assert off < 2 * error + 0.03  # of -2.6, which a tooth has: some meet the window twice, and scatter
     assert error < 0.1
 
 
