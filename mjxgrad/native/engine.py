@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from mjxgrad._warnings import collected
 from mjxgrad.native.events import HAIR, Events, Near, Surfaces, clearance, levers_of, undecided
-from mjxgrad.native.pairs import Pair, num_slots, settle
+from mjxgrad.native.pairs import End, Pair, num_slots, settle
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
 
@@ -361,7 +361,12 @@ class _Worker:
         push: np.ndarray,
     ) -> tuple[Float[np.ndarray, " size"], list[float]]:  # fmt: skip
         """Return what a step makes of a change and of one of the controls, without events, and what each event feels."""
-        nv, rest, moved, felt = model.nv, change.copy(), np.zeros_like(change), [one.felt @ change for one in pairs]
+        nv, rest, moved, felt = (
+            model.nv,
+            change.copy(),
+            np.zeros_like(change),
+            [(one.felt @ change).item() for one in pairs],
+        )
         if near is not None and near.events is not None:
             rest[:nv] -= near.events.moves @ felt
         if near is not None and near.is_rough:
@@ -477,7 +482,7 @@ class _Worker:
             row = self._moved(model, row, 8 * change)
         return row
 
-    def _at(self, row: np.ndarray, end: list[np.ndarray]) -> np.ndarray:
+    def _at(self, row: np.ndarray, end: End) -> np.ndarray:
         """Return a whole state with position, velocity and activation of another."""
         placed = row.copy()
         for name, value in zip(START[1:], end, strict=True):
