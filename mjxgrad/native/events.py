@@ -27,8 +27,7 @@ an event costs four more steps, and a step without any costs nothing.
 - **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
   wider, holds all of them, with as much less weight. Both motions are followed for two steps alone: on gymnasium's robots
   derivatives then scatter half as far.
-- **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step (of Runge-Kutta, |J v| is
-  that of its travel), and ε = 0.06 of the
+- **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply. These move by about as much as
   a step of free acceleration a, less what damping keeps of it, h² |J a|. ε is no larger, since a window that is wider than the
   travel of what lands or creeps slowly biases it.

@@ -31,11 +31,11 @@ class Pair:
     """Two motions that begin at either side of an event.
 
     Attributes:
-        model: what both are motions of.
+        model: the model of both.
         ends: where both are.
         distance: how far apart they began.
-        felt: by how much of that distance a change of the state moves the event.
-        scale: by what entries of a difference are compared.
+        felt: the share of that distance by which a change of the state moves the event.
+        scale: weights of the entries of a difference.
         apart: how far apart they are after each step, over the distance.
         place: which course, and which of its steps, the event is in.
         by_others: `felt`, by each entry of what else moves gaps.
