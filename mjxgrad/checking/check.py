@@ -163,7 +163,14 @@ def check(
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
         with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(
-                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
+                scene,
+                motions,
+                mover,
+                rng,
+                from_start=cost is not None,
+                seconds=_MOVED * budget,
+                log=say,
+                first=lambda one: say(f"- First verdict. {findings.slope_finding(findings.slopes(one)).text}"),
             )
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)

@@ -185,7 +185,7 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
         until = min(one.crossover for one in scattered)
         text = f"Derivatives of single motions scatter more than zeroth order from {until:.2g} s on."
         yield Finding("explodes", text + " Shorten the horizon or soften the contact.", True)
-    yield _slope_finding(slopes(measured))
+    yield slope_finding(slopes(measured))
     yield from _time_step_findings(measured)
     yield from _order_findings(measured)
 
@@ -200,7 +200,8 @@ def left_out_findings(measured: Measured | None, budget: int | float) -> Iterato
         yield Finding("left_out", text)
 
 
-def _slope_finding(found: Sequence[Slope]) -> Finding:
+def slope_finding(found: Sequence[Slope]) -> Finding:
+    """Return how far each derivative is from the slope; a fault where all are off."""
     if not found[-1].num_readings:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     read = [one for one in found if one.num_readings]
@@ -355,4 +356,6 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
 
 def percent(share: float) -> str:
     """Return a share as text."""
-    return "under 0.01 %" if share < 1e-4 else f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+    if not 1e-4 <= share <= 10:
+        return "under 0.01 %" if share < 1e-4 else "over 1000 %"
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"

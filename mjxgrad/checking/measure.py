@@ -101,8 +101,9 @@ def measure(
     from_start: bool,
     seconds: int | float,
     log: Callable[[str], None],
+    first: Callable[["Measured"], None],
 ) -> Measured:
-    """Measure along lines and under noise within a budget in seconds, and leave out the rest."""
+    """Measure along lines and under noise within a budget in seconds, and leave out the rest; `first` gets the first line."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
@@ -138,6 +139,8 @@ def measure(
             if time.perf_counter() + num_batches * num_steps * mover.step_seconds > mover.end:
                 raise TimeoutError
             found.append(task())
+            if is_first:
+                first(Measured(np.array(lengths) * motions.timestep, tuple(found), ()))
         except TimeoutError:
             left_out.append(words)
         except KeyboardInterrupt:

@@ -153,8 +153,8 @@ def measuring():
     scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
     motions, stability = random_motions(scene, rng), mg.check_stability(scene, speed=1.0)
 
-    def measured_by(mover):
-        return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=lambda _: None)
+    def measured_by(mover, first=lambda _: None):
+        return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=lambda _: None, first=first)
 
     return measured_by, lambda measured: recommend(motions, stability, measured, None)
 
@@ -179,7 +179,8 @@ class OutOfTime(Mover):
 
 def test_questions_that_there_is_no_time_for_are_left_out_by_name(measuring):
     measured_by, advise = measuring
-    measured = measured_by(OutOfTime())
+    measured = measured_by(OutOfTime(), (told := []).append)
+    assert [(len(one.lines), len(one.noises)) for one in told] == [(1, 0)]  # said before all else is measured
     assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
     (told,) = left_out_findings(measured, 60)
     for words in ("budget of 60 s", "a line along the controls", "noise of 0.3", "contacts at"):
@@ -424,5 +425,5 @@ def test_warnings_of_other_libraries_are_said_once_and_none_is_empty():
 def test_derivatives_that_are_mostly_off_are_a_fault(num_off, is_fault):
     """Where one kind is right at half of 23 readings it is recommended without a word."""
     kinds = zip(("slope", "discrete"), num_off, strict=True)
-    found = findings._slope_finding([findings.Slope(kind, off, 23, 0.3) for kind, off in kinds])
+    found = findings.slope_finding([findings.Slope(kind, off, 23, 0.3) for kind, off in kinds])
     assert found.is_fault == is_fault
