@@ -71,7 +71,7 @@ throughput: .venv/.installed  ## measure a sweep over softness in one program ag
 engines: .venv/.installed  ## measure a gradient by C MuJoCo, by MJX and by hand
 	@$(BIN)/python -m experiments engines $(ARGS)
 
-costs: .venv/.installed  ## measure what onset, event gradient and smoothing cost
+costs: .venv/.installed  ## measure what slope, onset and smoothing cost
 	@$(BIN)/python -m experiments costs $(ARGS)
 
 rates: .venv/.installed  ## measure how often a robot can be planned for, beside a plain iLQR

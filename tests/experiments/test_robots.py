@@ -78,7 +78,7 @@ def test_a_wrong_derivative_and_a_process_that_ends_are_failures():
     assert robots.failures("c_double", right | {"B": 2e-4}) == ["B is off by 0.0002"]
     assert robots.failures("mjx_single", right | {"motion": 0.01}) == ["motion is off by 0.01 without a warning"]
     assert robots.failures("mjx_single", right | {"A": np.nan}) == ["A is off by nan"]
-    assert robots.failures("mjx_single", right | {"A": np.nan, "flagged": True}) == []
+    assert robots.failures("mjx_single", right | {"flagged": True}) == ["the step diverges"]
     (found,) = (one for _, one in robots.measured("load", ["missing.xml"], 60.0))
     assert found["nv"] == 0
 
