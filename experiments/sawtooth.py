@@ -217,7 +217,7 @@ def course(
 
     Of each arm: `residual`, the outcome less its trend over the starts, and its standard deviation, the `sawtooth`; the
     `derivative` at each start and their `spread` about the trend, over the slope; `slope`, `mean` and `mean_error`; the
-    `error` of the mean over the slope, what of it is in `excess` of two standard errors, and whether it is `within` these;
+    `error` of the mean over the slope, what of it is in `excess` of two standard errors, and whether it is `right` to these or 5 %;
     the mean distance `far` from the reference, MuJoCo's motion at a much shorter step, NaN without one. Of all: where
     MuJoCo's outcome has teeth (`has_impact`), how many times `smaller` they are with an onset, the `shift` of the mean
     outcome by it, over MuJoCo's teeth, and `closer`, its distance from the reference over MuJoCo's.
@@ -235,7 +235,7 @@ def course(
     data["sawtooth"] = data.residual.std("start")
     off, slope = abs(data["mean"] - data.slope), np.maximum(abs(data.slope), data.resolution)
     data["error"], data["excess"] = off / slope, np.maximum(off - 2 * data.standard_error, 0) / slope
-    data["within"] = off <= 2 * np.maximum(data.standard_error, data.resolution)
+    data["right"] = off <= np.maximum(2 * np.maximum(data.standard_error, data.resolution), 0.05 * slope)
     missing = np.full_like(found[0].outcomes, np.nan) if reference is None else reference
     data["far"] = abs(data.outcome - xr.DataArray(missing, dims=_SAMPLE[1:])).mean("start")
     spread = np.stack([_without_trend(start, one.derivatives[0]).std(axis=0) for one in found])
@@ -376,7 +376,7 @@ def answer(outcome: Outcome) -> str:
     smaller = _pooled(outcome, "smaller")
     if not smaller.size:
         return "Nothing touches in these motions: there are no teeth."
-    right = percent(_pooled(outcome, "within", CONTINUOUS).mean())
+    right = percent(_pooled(outcome, "right", CONTINUOUS).mean())
     return (
         f"With an onset the sawtooth is {np.median(smaller):.0f} times smaller, its mean derivative right at {right}."
     )
@@ -387,12 +387,12 @@ def verdict(outcome: Outcome) -> str:
     smaller, spread = _pooled(outcome, "smaller"), _pooled(outcome, "spread", CONTINUOUS)
     if not smaller.size:
         return "Nothing touches in these motions: there are no teeth."
-    within = {arm: _pooled(outcome, "within", arm).mean() for arm in _ARMS}
+    right = {arm: _pooled(outcome, "right", arm).mean() for arm in _ARMS}
     return (
         f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
         f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
-        f"standard errors at {within[CONTINUOUS]:.0%} of {smaller.size} readings. Along MuJoCo's own motion the slope is right "
-        f"at {within[NATIVE]:.0%} by C MuJoCo and {within[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {within[DISCRETE]:.0%}. "
+        f"standard errors or 5% at {right[CONTINUOUS]:.0%} of {smaller.size} readings. Along MuJoCo's own motion the slope is "
+        f"right at {right[NATIVE]:.0%} by C MuJoCo and {right[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {right[DISCRETE]:.0%}. "
         f"Single derivatives scatter by {np.median(spread):.2f} of the slope with an onset, "
         f"{np.median(_pooled(outcome, 'spread', NATIVE)):.2f} by C MuJoCo."
     )
@@ -421,20 +421,20 @@ def tables(outcome: Outcome) -> list[Table]:
             continue
         picked = c.where(c.has_impact)
         middle = picked.median(("time", "coordinate"))
-        within = (c.within & c.has_impact).sum(("time", "coordinate"))
+        right = (c.right & c.has_impact).sum(("time", "coordinate"))
         row = [str(c.title.values), f"{1e3 * float(c.timestep):g}"]
         row.append(f"{float(middle.smaller):.0f} ({float(picked.smaller.min()):.1f})")
         row += [f"{value:.2g}" for value in middle.spread.values] + [f"{value:.1%}" for value in middle.error.values]
-        row += [f"{value} of {int(c.has_impact.sum())}" for value in within.values]
+        row += [f"{value} of {int(c.has_impact.sum())}" for value in right.values]
         row.append(f"{float(middle['shift']):.2f}")
         rows.append([*row, "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"])
     columns = ["motion", "time step, ms", "sawtooth smaller, times"]
-    columns += [f"{what}, {arm}" for what in ("spread", "error", "within 2 errors") for arm in _ARMS]
+    columns += [f"{what}, {arm}" for what in ("spread", "error", "right") for arm in _ARMS]
     columns += ["shift of the mean", "off the converged motion"]
     caption = (
         "Medians over times and coordinates with an impact before them; in brackets the least. Spread: standard deviation of "
         "single derivatives about their trend, over the slope. Error: of the mean derivative, over the slope of its own outcome, "
-        "sampling errors included; within 2 errors: readings where it is no more than these. Shift of the mean outcome over "
+        "sampling errors included; right: readings where it is within two of these or 5%. Shift of the mean outcome over "
         "MuJoCo's sawtooth. Distance of the outcome from the converged motion over MuJoCo's own."
     )
     return [Table(columns, rows, caption)]
