@@ -2,8 +2,8 @@ r"""Two motions from either side of an event, followed until the derivative alon
 
 A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
 steps both have been, and differ little. Between, the outcome's change is D_j L x, with D_j the difference of the two motions
-after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a tenth, in three steps
-in a row, A the derivative of each of these along the motion, its events as they are after one step; or after thirty steps.
+after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a twentieth, in three
+steps in a row, A the derivative of each of these along the motion, its events as they are after one step; or after a hundred steps.
 
 A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
 a difference of two motions is not.
@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Float
 
 # Let go after one step that is alike, a rolling ball's derivatives scatter twice as far. Of a falling arm that bounces twice,
-# four keep both motions until the second bounce, which then is not averaged over its own phases.
-_NUM_ALIKE, _ALIKE = 3, 0.1
-_FEWEST_SLOTS = 24
+# four keep both motions until the second bounce, which then is not averaged over its own phases. Alike to a tenth, within thirty
+# steps and half the slots, derivatives of dm_control's walker that falls for half a second scatter ten times as far.
+_NUM_ALIKE, _ALIKE = 3, 0.05
+_FEWEST_SLOTS = 48
 
 End = Sequence[np.ndarray]
 """Position, velocity and activation."""
@@ -51,7 +52,7 @@ class Pair:
     apart: list[Float[np.ndarray, " size"]]
     place: tuple[int, int] = (0, 0)
     by_others: dict[str, np.ndarray] = field(default_factory=dict)
-    longest: int = 30
+    longest: int = 100
     num_alike: int = 0
 
     @property
