@@ -14,7 +14,7 @@ error falls as 1/cells at a jump and faster elsewhere. Quadrature on regular poi
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
@@ -50,6 +50,8 @@ _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
 ESTIMATES = {"first": "first order", "zeroth": "zeroth order", "alpha_order": "α-order"}
 _HIDDEN = 30.0  # times the usual gradient
+_EXPLODES = "explodes"
+_BEYOND = 1e12  # times the largest gradient, from which numbers tell nothing
 _LOOKS = {"first": ("#d55e00", "o", "-"), "zeroth": ("#0072b2", "s", "--"), "alpha_order": ("#009e73", "D", ":")}
 _NORMAL = 10**6  # samples, of which Student's t distribution is normal
 _TOO_STIFF = "without gaining energy"  # part of the warning about a contact that the time step cannot follow
@@ -202,16 +204,21 @@ class BiasVariance(eqx.Module, Printed):
         first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
         heads = [title, *["at"] * is_many, "truth", f"bias: {first}", *rest, f"variance: {first}", *rest]
         lines = [[*heads, *["α"] * has_alpha]]
+        beyond = self._beyond
         for i, j in np.ndindex(self.cost.shape):
             one = {name: value[i, j] for name, value in table.items()}
-            half = {x: f" ± {(one[f'{x}_high'] - one[f'{x}_low']) / 2:.2g}" for x in one if f"{x}_low" in one}
-            truth, *biases = (f"{one[x]:.3g}{half[x]}" for x in ("truth", *(f"{name}_bias" for name in names)))
+            truth, *biases = (_with_half(one, x, beyond) for x in ("truth", *(f"{name}_bias" for name in names)))
             biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
             label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(self._too_stiff[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
-            variances = [f"{one[f'{name}_variance']:.2g}" for name in names]
+            variances = [f"{x:.2g}" if not x > beyond**2 else _EXPLODES for x in (one[f"{y}_variance"] for y in names)]
             at = [" ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)] * is_many
             lines.append([label, *at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
         return lines
+
+    @property
+    def _beyond(self) -> float:
+        """The size from which a gradient has exploded."""
+        return _BEYOND * (np.nanmax(np.abs(self.table()["truth"]), initial=0.0).item() or 1.0)
 
     def notes(self) -> list[str]:
         """Return sentences that explain the table, and a warning where the time step is too long."""
@@ -244,10 +251,12 @@ class BiasVariance(eqx.Module, Printed):
         size = (max(4.6, 3.2 * points), 2.7 * len(shown) + 0.5 * (only is not None))
         figure, axes = plt.subplots(len(shown), points, figsize=size, **settings)
         for row, what in zip(axes, shown, strict=True):
+            beyond = self._beyond if what == "bias" else self._beyond**2
             for j, axis in enumerate(row):
                 for name, (colour, marker, line) in _LOOKS.items():
                     if f"{name}_{what}" in table:
                         y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
+                        y, low, high = np.where(np.abs(high) < beyond, [y, low, high], np.nan)
                         look = {"color": colour, "marker": marker, "ls": line, "label": ESTIMATES[name]}
                         axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
                 is_log = what == "variance" and any((line.get_ydata() > 0).any() for line in axis.lines)
@@ -265,6 +274,12 @@ class BiasVariance(eqx.Module, Printed):
             axis.set_xlabel(title)
         axes[0, 0].legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
         return figure
+
+
+def _with_half(numbers: Mapping[str, np.ndarray], name: str, beyond: float) -> str:
+    """Return a number with half its interval as text."""
+    value, low, high = (numbers[f"{name}{end}"] for end in ("", "_low", "_high"))
+    return _EXPLODES if abs(value) > beyond else f"{value:.3g} ± {(high - low) / 2:.2g}"
 
 
 def bias_variance(

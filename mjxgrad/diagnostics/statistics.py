@@ -44,7 +44,8 @@ def bootstrap_variance_interval(
 
     settings = {"n_resamples": 1000, "batch": _BATCH, "vectorized": True, "method": "percentile", "rng": 0}
     chosen = (np.arange(len(samples)),)
-    found = stats.bootstrap(chosen, variance, confidence_level=checked(confidence), **settings)
+    with np.errstate(over="ignore", invalid="ignore"):  # derivatives that explode have an infinite one
+        found = stats.bootstrap(chosen, variance, confidence_level=checked(confidence), **settings)
     return np.array(found.confidence_interval)
 
 

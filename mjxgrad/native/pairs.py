@@ -3,7 +3,7 @@ r"""Two motions from either side of an event, followed until the derivative alon
 A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
 steps both have been, and differ little. Between, the outcome's change is D_j L x, with D_j the difference of the two motions
 after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a twentieth, in three
-steps in a row, A the derivative of each of these along the motion, its events as they are after one step; or after a hundred steps.
+steps in a row, or after a hundred. A is the derivative of each of these along the motion, its events as they are after one step.
 
 A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
 a difference of two motions is not.
