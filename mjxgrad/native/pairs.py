@@ -22,6 +22,7 @@ from jaxtyping import Float
 # steps and half the slots, derivatives of dm_control's walker that falls for half a second scatter ten times as far.
 _NUM_ALIKE, _ALIKE = 3, 0.05
 _FEWEST_SLOTS = 48
+_FAR = 10.0
 
 End = Sequence[np.ndarray]
 """Position, velocity and activation."""
@@ -58,7 +59,8 @@ class Pair:
     @property
     def is_over(self) -> bool:
         """Whether the motion's derivative may take over."""
-        return self.num_alike >= _NUM_ALIKE or len(self.apart) >= self.longest
+        is_near = np.linalg.norm(self.scale * self.apart[-1]) <= _FAR
+        return (self.num_alike >= _NUM_ALIKE and is_near) or len(self.apart) >= self.longest
 
     def size(self, step: int) -> float:
         """Return how far apart both are before a step of the course, infinite where they begin."""
