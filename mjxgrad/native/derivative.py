@@ -78,7 +78,8 @@ def roll_out(
             (change, kept), rest = carry, 0.0
             end = product(step["state"], change) + step["by state"]
             if "felt" in step:
-                held = kept + product(step["felt"], change) + step["by felt"]
+                is_own = (step["slot"] == jnp.arange(len(kept))[:, None]).astype(kept.dtype)
+                held = kept + product(is_own, product(step["felt"], change) + step["by felt"])
                 kept = step["stays"] * held
                 end, rest = end + product(step["apart"], held), product(step["apart"], kept)
             return (end - rest, kept), end

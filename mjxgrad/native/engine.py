@@ -23,9 +23,9 @@ from mjxgrad.stepping import Gradient
 INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat")
 """What may be given to each step, in the order in which MuJoCo keeps it."""
 START = ("time", "qpos", "qvel", "act")
-PAIRS = ("felt", "apart", "stays")
-"""Of a slope over several steps, with one entry for each pair of motions that is followed: what it feels of a change where it
-begins, how far apart it is after the step, and whether it goes on.
+PAIRS = ("felt", "slot", "apart", "stays")
+"""Of a slope over several steps. Of each pair of motions that begins: what it feels of a change, and which slot it gets. Of each
+slot: how far apart its pair is after the step, and whether it goes on.
 
 See `native.pairs`. As "felt geom_size" by an input or number that moves gaps.
 """
@@ -197,8 +197,13 @@ class Engine:
         """Return the shapes of the Jacobians of one step: of its end by all that is wanted, and of its sensors, "C" and "D"."""
         model, size = self.mj_model, 2 * self.mj_model.nv + self.mj_model.na
         own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu), "end": (size - model.nv + model.nq,)}
-        own |= {"felt": (count := num_slots(model), size), "apart": (size, count), "stays": (count,)}
-        own |= {k: (count if k.startswith("felt") else size, sizes[k.split()[-1]]) for k in wanted if k not in own}
+        own |= {
+            "felt": (model.nv, size),
+            "slot": (model.nv,),
+            "apart": (size, num_slots(model)),
+            "stays": (num_slots(model),),
+        }
+        own |= {k: (model.nv if k.startswith("felt") else size, sizes[k.split()[-1]]) for k in wanted if k not in own}
         return {"state": (size, size)} | {k: own[k] for k in wanted}
 
     def _share(self, work: Callable[["_Worker", list[int]], None], count: int) -> None:
@@ -657,7 +662,8 @@ def _through(found: dict[str, np.ndarray], names: list[str]) -> dict[str, np.nda
     for t, matrix in enumerate(found["state"]):
         end = matrix @ main + own[t]
         if felt is not None:
-            held = found["felt"][t] @ main + felt[t] + kept
+            is_own = found["slot"][t][..., None, :] == np.arange(found["stays"].shape[-1])[:, None]
+            held = is_own @ (found["felt"][t] @ main + felt[t]) + kept
             kept = found["stays"][t][..., None] * held
             end = end + found["apart"][t] @ held
             main = end - found["apart"][t] @ kept

@@ -3,7 +3,8 @@ r"""Two motions from either side of an event, followed until the derivative alon
 A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
 steps both have been, and differ little. Between, the outcome's change is D_j L x, with D_j the difference of the two motions
 after j steps over their distance before. It joins the change x along the motion once D_{j+1} = A D_j to a twentieth, in three
-steps in a row, or after a hundred. A is the derivative of each of these along the motion, its events as they are after one step.
+steps in a row, and is at most 10; or after a hundred steps. A is the derivative of each of these along the motion, its events as
+they are after one step. Motions that are farther apart span many phases of the next event, and a derivative would multiply there.
 
 A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
 a difference of two motions is not.
@@ -21,8 +22,8 @@ from jaxtyping import Float
 # four keep both motions until the second bounce, which then is not averaged over its own phases. Alike to a tenth, within thirty
 # steps and half the slots, derivatives of dm_control's walker that falls for half a second scatter ten times as far.
 _NUM_ALIKE, _ALIKE = 3, 0.05
-_FEWEST_SLOTS = 48
-_FAR = 10.0
+_FEWEST_SLOTS = 96
+_FAR = 10.0  # times the distance at first; the arm is off with 5
 
 End = Sequence[np.ndarray]
 """Position, velocity and activation."""
@@ -59,8 +60,9 @@ class Pair:
     @property
     def is_over(self) -> bool:
         """Whether the motion's derivative may take over."""
-        is_near = np.linalg.norm(self.scale * self.apart[-1]) <= _FAR
-        return (self.num_alike >= _NUM_ALIKE and is_near) or len(self.apart) >= self.longest
+        if len(self.apart) >= self.longest:
+            return True
+        return self.num_alike >= _NUM_ALIKE and np.linalg.norm(self.scale * self.apart[-1]).item() <= _FAR
 
     def size(self, step: int) -> float:
         """Return how far apart both are before a step of the course, infinite where they begin."""
@@ -86,7 +88,7 @@ class Pair:
 
 def num_slots(model: mujoco.MjModel) -> int:
     """Return how many pairs of a motion are followed at a time; a step begins no more than there are velocities."""
-    return max(2 * model.nv, _FEWEST_SLOTS)
+    return max(3 * model.nv, _FEWEST_SLOTS)
 
 
 def settle(pairs: Sequence[Pair], found: Mapping[str, np.ndarray]) -> None:
@@ -96,7 +98,7 @@ def settle(pairs: Sequence[Pair], found: Mapping[str, np.ndarray]) -> None:
 
     Args:
         pairs: those of all courses.
-        found: "felt", "apart" and "stays", and "felt name" of others, with axes of courses and steps in front.
+        found: "felt", "slot", "apart" and "stays", and "felt name" of others, with axes of courses and steps in front.
     """
     slots = range(found["stays"].shape[-1])
     for _, course in groupby(sorted(pairs, key=lambda one: one.place), key=lambda one: one.place[0]):
@@ -104,17 +106,18 @@ def settle(pairs: Sequence[Pair], found: Mapping[str, np.ndarray]) -> None:
         held = []
         for now, begun in groupby(course, key=lambda one: one.place[1]):
             holder = {slot: one for slot, one in holder.items() if one.place[1] + len(one.apart) > now}
-            for one in begun:
+            for number, one in enumerate(begun):
                 free = [slot for slot in slots if slot not in holder]
                 slot = free[0] if free else min(holder, key=lambda k: holder[k].size(now))
                 if not free:
                     del holder[slot].apart[now - holder[slot].place[1] :]
                 holder[slot] = one
-                held.append((slot, one))
-        for slot, one in held:
-            (number, first), last = one.place, one.place[1] + len(one.apart)
-            found["apart"][number, first:last, :, slot] = one.apart
-            found["stays"][number, first : last - 1, slot] = 1.0
-            found["felt"][number, first, slot] = one.felt
+                held.append((number, slot, one))
+        for number, slot, one in held:
+            (course_number, first), last = one.place, one.place[1] + len(one.apart)
+            found["apart"][course_number, first:last, :, slot] = one.apart
+            found["stays"][course_number, first : last - 1, slot] = 1.0
+            found["slot"][course_number, first, number] = slot
+            found["felt"][course_number, first, number] = one.felt
             for name, share in one.by_others.items():
-                found[f"felt {name}"][number, first, slot] = share
+                found[f"felt {name}"][course_number, first, number] = share

@@ -27,6 +27,16 @@ def test_a_pair_is_over_once_three_steps_in_a_row_are_explained_to_a_twentieth()
     assert len(pair.apart) == 10
 
 
+def test_a_pair_that_is_explained_goes_on_while_it_is_far_apart():
+    """Eleven times as far as at first; then nine times."""
+    pair = _pair((0, 0), [[11.0, 0.0]])
+    for factor in (1.0, 1.0, 1.0, 9 / 11):
+        assert not pair.is_over
+        found = factor * pair.apart[-1]
+        assert pair.go_on([], pair.distance * found, found)
+    assert pair.is_over
+
+
 def test_a_pair_whose_derivative_never_explains_it_is_let_go():
     pair, num_steps = _pair((0, 0), [[1.0, 0.0]]), 1
     while not pair.is_over:
@@ -40,7 +50,7 @@ def test_what_pairs_add_is_the_sum_of_their_differences():
     rng = np.random.default_rng(0)
     matrices = rng.normal(size=(6, 1, 2, 2))
     pairs = [_pair((0, k), (0.01 if k == 0 else 1.0) * rng.normal(size=(4, 2)), rng.normal(size=2)) for k in (0, 1, 2)]
-    shapes = {"felt": (2, 2), "apart": (2, 2), "stays": (2,)}
+    shapes = {"felt": (2, 2), "slot": (2,), "apart": (2, 2), "stays": (2,)}
     found = {name: np.zeros((1, 6, *shapes[name])) for name in PAIRS}
     settle(pairs, found)
     assert [len(one.apart) for one in pairs] == [2, 4, 4]
