@@ -18,7 +18,7 @@ an event costs four more steps, and a step without any costs nothing.
   a short contact lets go, one that chatters comes back. So both go on, step by step, until A₀ explains how they differ. Changes
   then go two ways, x' = A₀ (1 - P L) x + D_k x₋, with D_k the difference after k steps and x₋ what the event felt before them.
   Until then D_j x₋ is the outcome's alone. See `native.pairs`. Without, derivatives of gymnasium's hopper scatter ten to thirty
-  times as far, and chatter multiplies them at each event: those of a ball that a box pushes scatter by 93, not 0.15.
+  times as far, and chatter multiplies them at each event: those of a ball that a box pushes scatter by 93, not 0.26.
 
 - **Together.** The corners of a box that lands flat cross their surface in one step, and what each does depends on the others.
   Contacts that share coordinates are therefore taken by modes, the left singular vectors of their rows: all gaps alike, then

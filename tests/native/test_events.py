@@ -197,7 +197,7 @@ def test_where_contact_chatters_derivatives_are_the_slope_and_do_not_multiply():
     outcomes, derivatives = course["qpos"][:, [149, -1], 0], course["change"][:, [149, -1], 0]
     found = compare_to_slope(targets, outcomes, [derivatives], ("slope",))
     assert (np.abs(found.error[0]) < 2 * found.standard_error[0] + 0.02 * found.slope).all()
-    assert (found.spread[0] < 0.13 * found.slope).all()  # 0.17, were pairs let go that are explained but far apart
+    assert (found.spread[0] < 0.2 * found.slope).all()  # 0.24, let go to a tenth or after thirty steps
 
 
 def test_a_hopper_that_lands_on_its_limits_has_its_slope():
