@@ -217,7 +217,7 @@ def course(
 
     Of each arm: `residual`, the outcome less its trend over the starts, and its standard deviation, the `sawtooth`; the
     `derivative` at each start and their `spread` about the trend, over the slope; `slope`, `mean` and `mean_error`; the
-    `error` of the mean over the slope, what of it is in `excess` of two standard errors, and whether it is `right` to these or 5 %;
+    `error` of the mean over the slope, what of it is in `excess` of two standard errors, and if it is `right` to these or 5 %;
     the mean distance `far` from the reference, MuJoCo's motion at a much shorter step, NaN without one. Of all: where
     MuJoCo's outcome has teeth (`has_impact`), how many times `smaller` they are with an onset, the `shift` of the mean
     outcome by it, over MuJoCo's teeth, and `closer`, its distance from the reference over MuJoCo's.
@@ -391,8 +391,8 @@ def verdict(outcome: Outcome) -> str:
     return (
         f"The sawtooth is {np.median(smaller):.0f} times smaller in the median ({np.quantile(smaller, 0.1):.0f} at the tenth "
         f"percentile) when contacts begin within the step. The mean of the plain derivative is then the slope within two "
-        f"standard errors or 5% at {right[CONTINUOUS]:.0%} of {smaller.size} readings. Along MuJoCo's own motion the slope is "
-        f"right at {right[NATIVE]:.0%} by C MuJoCo and {right[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {right[DISCRETE]:.0%}. "
+        f"standard errors or 5% at {right[CONTINUOUS]:.0%} of {smaller.size} readings. In MuJoCo's own motion the slope is right "
+        f"at {right[NATIVE]:.0%} by C MuJoCo and {right[SLOPE]:.0%} by MJX, MuJoCo's own derivative at {right[DISCRETE]:.0%}. "
         f"Single derivatives scatter by {np.median(spread):.2f} of the slope with an onset, "
         f"{np.median(_pooled(outcome, 'spread', NATIVE)):.2f} by C MuJoCo."
     )

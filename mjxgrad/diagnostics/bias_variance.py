@@ -276,7 +276,7 @@ class BiasVariance(eqx.Module, Printed):
         return figure
 
 
-def _with_half(numbers: Mapping[str, np.ndarray], name: str, beyond: float) -> str:
+def _with_half(numbers: Mapping[str, Any], name: str, beyond: float) -> str:
     """Return a number with half its interval as text."""
     value, low, high = (numbers[f"{name}{end}"] for end in ("", "_low", "_high"))
     return _EXPLODES if abs(value) > beyond else f"{value:.3g} ± {(high - low) / 2:.2g}"

@@ -1,5 +1,6 @@
 """Bias and variance, measured where both are known."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,6 +138,17 @@ def test_the_table_says_what_is_biased_and_how_large(jumps):
     cells = lines[9].split("  ")  # of the largest height, at the last point
     assert cells[0] == "3"
     assert any(cell.strip().endswith("*") for cell in cells)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_derivatives_that_explode_are_named_and_leave_the_picture_to_the_others(ramps):
+    """As of a contact that gains energy: numbers, but of 200 digits."""
+    value, variance = ramps.first.value.at[2].set(1e200), ramps.first.covariance_diagonal.at[2].set(jnp.inf)
+    table = eqx.tree_at(lambda one: (one.first.value, one.first.covariance_diagonal), ramps, (value, variance))
+    assert [sum(cell.startswith("explodes") for cell in row) for row in table.rows()] == [0] * 7 + [2] * 3
+    figure = table.plot()
+    assert max(map(abs, figure.axes[0].get_ylim())) < 1e6
+    figure.canvas.draw()
 
 
 def test_the_landscape_is_the_cost(jumps):
