@@ -255,8 +255,8 @@ class BiasVariance(eqx.Module, Printed):
             for j, axis in enumerate(row):
                 for name, (colour, marker, line) in _LOOKS.items():
                     if f"{name}_{what}" in table:
-                        y, low, high = (table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high"))
-                        y, low, high = np.where(np.abs(high) < beyond, [y, low, high], np.nan)
+                        ends = np.array([table[f"{name}_{what}{end}"][:, j] for end in ("", "_low", "_high")])
+                        y, low, high = np.where((np.abs(ends) < beyond).all(axis=0), ends, np.nan)
                         look = {"color": colour, "marker": marker, "ls": line, "label": ESTIMATES[name]}
                         axis.errorbar(swept, y, np.maximum([y - low, high - y], 0), ms=4, lw=1, capsize=2, **look)
                 is_log = what == "variance" and any((line.get_ydata() > 0).any() for line in axis.lines)
