@@ -101,7 +101,7 @@ def teeth(smaller):
     found = xr.Dataset(
         {"smaller": ("time", [smaller] * 2), "has_impact": ("time", [True] * 2)}, {"arm": ["continuous onset"]}
     )
-    return SimpleNamespace(courses=[found.assign(within=(("arm", "time"), [[True, False]]))])
+    return SimpleNamespace(courses=[found.assign(right=(("arm", "time"), [[True, False]]))])
 
 
 SEES = {"first order": True, "zeroth order": False, "α-order": False}
