@@ -331,8 +331,8 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
     if found.get("lost"):
         return [f"NaN without a flag at {found['lost']} starts"]
     if verdict := found.get("steps"):
-        by = "{slope:.3g} by {error:.3g} ± {standard_error:.2g}"
-        return [f"off a slope of {by.format(**found)} (one error)"] * (verdict == "off")
+        off = f"off a slope of {found['slope']:.3g} by {found['error']:.3g} ± {2 * found['standard_error']:.2g}"
+        return [off] * (verdict == "off")
     largest, farthest = _LIMITS[part]
     wrong = ["the step diverges"] * found["flagged"]
     wrong += [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found[name] <= largest]

@@ -204,7 +204,7 @@ class BiasVariance(eqx.Module, Printed):
         first, *rest = (ESTIMATES[name].removesuffix(" order") for name in names)
         heads = [title, *["at"] * is_many, "truth", f"bias: {first}", *rest, f"variance: {first}", *rest]
         lines = [[*heads, *["α"] * has_alpha]]
-        beyond = self._beyond
+        beyond = _beyond(table)
         for i, j in np.ndindex(self.cost.shape):
             one = {name: value[i, j] for name, value in table.items()}
             truth, *biases = (_with_half(one, x, beyond) for x in ("truth", *(f"{name}_bias" for name in names)))
@@ -214,11 +214,6 @@ class BiasVariance(eqx.Module, Printed):
             at = [" ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)] * is_many
             lines.append([label, *at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
         return lines
-
-    @property
-    def _beyond(self) -> float:
-        """The size from which a gradient has exploded."""
-        return _BEYOND * (np.nanmax(np.abs(self.table()["truth"]), initial=0.0).item() or 1.0)
 
     def notes(self) -> list[str]:
         """Return sentences that explain the table, and a warning where the time step is too long."""
@@ -251,7 +246,7 @@ class BiasVariance(eqx.Module, Printed):
         size = (max(4.6, 3.2 * points), 2.7 * len(shown) + 0.5 * (only is not None))
         figure, axes = plt.subplots(len(shown), points, figsize=size, **settings)
         for row, what in zip(axes, shown, strict=True):
-            beyond = self._beyond if what == "bias" else self._beyond**2
+            beyond = _beyond(table) if what == "bias" else _beyond(table) ** 2
             for j, axis in enumerate(row):
                 for name, (colour, marker, line) in _LOOKS.items():
                     if f"{name}_{what}" in table:
@@ -274,6 +269,11 @@ class BiasVariance(eqx.Module, Printed):
             axis.set_xlabel(title)
         axes[0, 0].legend(fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
         return figure
+
+
+def _beyond(table: Mapping[str, np.ndarray]) -> float:
+    """Return the size from which a gradient has exploded."""
+    return _BEYOND * (np.nanmax(np.abs(table["truth"]), initial=0.0).item() or 1.0)
 
 
 def _with_half(numbers: Mapping[str, Any], name: str, beyond: float) -> str:

@@ -366,12 +366,8 @@ class _Worker:
         push: np.ndarray,
     ) -> tuple[Float[np.ndarray, " size"], list[float]]:  # fmt: skip
         """Return what a step makes of a change and of one of the controls, without events, and what each event feels."""
-        nv, rest, moved, felt = (
-            model.nv,
-            change.copy(),
-            np.zeros_like(change),
-            [(one.felt @ change).item() for one in pairs],
-        )
+        nv, rest, moved = model.nv, change.copy(), np.zeros_like(change)
+        felt = [(one.felt @ change).item() for one in pairs]
         if near is not None and near.events is not None:
             rest[:nv] -= near.events.moves @ felt
         if near is not None and near.is_rough:
