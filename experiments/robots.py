@@ -40,7 +40,7 @@ import pandas as pd
 import mjxgrad as mg
 from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.diagnostics import compare_to_slope, phases
-from mjxgrad.native.events import Surfaces, kept_by_damping, levers_of, undecided
+from mjxgrad.engines.events import Surfaces, kept_by_damping, levers_of, undecided
 from mjxgrad.planning import SceneSystem
 from mjxgrad.rollouts.state import VELOCITY_LIMIT
 

@@ -28,8 +28,8 @@ from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
-from mjxgrad.native.derivative import to_coordinates
-from mjxgrad.native.engine import Engine
+from mjxgrad.engines import to_coordinates
+from mjxgrad.engines.mujoco import Engine
 from mjxgrad.stepping import Gradient, own_motion
 from mjxgrad.tasks import scene_path
 

@@ -22,8 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from mjxgrad.batched import device
 from mjxgrad.contact import Softness
 from mjxgrad.contact.parameters import geom_name
-from mjxgrad.native.derivative import to_coordinates
-from mjxgrad.native.engine import engine_of
+from mjxgrad.engines import engine_of, to_coordinates
 from mjxgrad.objective.task import finite_cost
 from mjxgrad.rollouts import State, Trajectory
 from mjxgrad.rollouts.state import VELOCITY_LIMIT, pose_warnings

@@ -17,7 +17,7 @@ from mjxgrad._arrays import instance, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native import linearise, roll_out, steer
+from mjxgrad.engines import product, roll_out, steer
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 from mjxgrad.rollouts.arguments import arguments_of, native_motion
@@ -142,11 +142,11 @@ class SceneSystem(System):
         """Return C MuJoCo's next state, NaN if it is not finite, and the derivative of its change by state and control."""
         begin, resting = arguments_of(self.scene, self._unflattened(state))
         inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
-        # Differences to one side are off by a few roundings of single precision, and take half as long.
-        how = {"gradient": self.contact.gradient, "is_centred": state.dtype != jnp.float32}  # pyright: ignore
-        how |= {"wanted": ("ctrl", "end"), "num_substeps": self.num_substeps}
-        found = linearise(self.scene, begin, inputs, **how)
-        return found["end"], jnp.concatenate([found["state"], found["ctrl"]], axis=1)
+        inputs = jax.tree.map(lambda x: jnp.concatenate([x] * self.num_substeps), inputs)
+        found = product(self.scene, begin, inputs, gradient=self.contact.gradient, wanted=("ctrl",))  # pyright: ignore
+        size = self.num_changes
+        matrix = jnp.concatenate([found["state"][:size, :size], found["ctrl"][:size]], axis=1)
+        return found["end"][: state.size], matrix
 
     def _unflattened(self, state: StateVector) -> State:
         nq, nv = self.scene.model.nq, self.scene.model.nv
@@ -159,7 +159,8 @@ class SceneSystem(System):
         if native is not None:
             begin, resting = arguments_of(self.scene, start)
             inputs = jax.tree.map(lambda x: jnp.stack([x] * self.num_substeps), resting | {"ctrl": control})
-            return jnp.concatenate([x[-1] for x in roll_out(self.scene, begin, inputs, native.gradient)])
+            found = roll_out(self.scene, begin, inputs, native.gradient)
+            return jnp.concatenate([found[name][-1] for name in ("qpos", "qvel", "act")])
 
         def advance(now: State, _: None) -> tuple[State, None]:
             data = data_of(self.scene, now, control)

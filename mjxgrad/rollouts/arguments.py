@@ -10,8 +10,8 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from mjxgrad._arrays import form, instance, is_known, known, real, whole
 from mjxgrad._mjx import mjx
-from mjxgrad.native import INPUTS, engine_of
-from mjxgrad.rollouts.state import State, check_scene
+from mjxgrad.engines import INPUTS, engine_of
+from mjxgrad.rollouts.state import State, check_scene, complete
 from mjxgrad.scene import Scene, SceneError
 from mjxgrad.stepping import Contact, OwnMotion, check_contact
 
@@ -90,10 +90,12 @@ def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
 
 
 def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return a state, and the scene's inputs beside controls where C MuJoCo begins with others, as `native` takes them."""
+    """Return a state, and the scene's inputs beside controls where C MuJoCo begins with others, as `engines` takes them."""
+    state, engine = complete(scene, state), engine_of(scene.mj_model)
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
-    resting, given = engine_of(scene.mj_model).start, {name: getattr(scene.data, name) for name in INPUTS[1:]}
-    is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(resting, name))  # noqa: E731
+    start |= {"history": state.history[: engine.first["history"].size], "plugin": state.history[engine.first["history"].size :]}
+    given = {name: getattr(scene.data, name) for name in INPUTS[1:]}
+    is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(engine.start, name))  # noqa: E731
     return start, {name: value for name, value in given.items() if value.size and not is_own(name)}
 
 

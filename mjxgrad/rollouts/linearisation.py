@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.native import linearise as by_mujoco
+from mjxgrad.engines import linearise as by_mujoco
 from mjxgrad.rollouts.arguments import arguments_of, check_start, native_motion, sequence_of
 from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
@@ -50,7 +50,9 @@ def linearise(
         start, resting = arguments_of(scene, state)
         inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
         found = by_mujoco(scene, start, inputs, gradient=native.gradient, wanted=("ctrl", "C", "D"))
-        return Linearisation(*(found[name] for name in ("state", "ctrl", "C", "D")))
+        size = 2 * scene.model.nv + scene.model.na  # histories of delays come after
+        A, B, C, D = (found[name] for name in ("state", "ctrl", "C", "D"))
+        return Linearisation(A[:size, :size], B[:size], C[:, :size], D)
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
     end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
 

@@ -7,7 +7,7 @@ compilation, differentiable once.
 import dataclasses
 import functools
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,10 +21,10 @@ from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.contact.collision import first_missed, slot_geoms
-from mjxgrad.native import roll_out
+from mjxgrad.engines import roll_out
 from mjxgrad.rollouts import arguments
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees, one_each
-from mjxgrad.rollouts.state import State, Trajectory, data_of, direction, is_sound, state_of
+from mjxgrad.rollouts.state import Pairs, State, Trajectory, complete, data_of, direction, is_sound, state_of
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
 from mjxgrad.stepping import Contact, Discrete, Gradient, Onset, Smoothing, forward, smoothing_warnings, step
@@ -147,7 +147,7 @@ class _Scan(eqx.Module):
         traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
         return _Carry(
-            state,
+            dataclasses.replace(state, pairs=None),
             self.scene.data.ctrl if looks else None,
             jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)),
             jnp.zeros((), jnp.int32),
@@ -171,7 +171,7 @@ class _Scan(eqx.Module):
         else:
             stepped, tangent, growth = self.measure(data, tangent, growth)
         moved = state_of(stepped)
-        is_bad = ~is_sound(moved)
+        is_bad = ~is_sound(moved.qpos, moved.qvel, moved.act)
         first_bad = jnp.where((carry.first_bad < 0) & is_bad, index, carry.first_bad)
         following = _Carry(
             jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved),
@@ -260,6 +260,7 @@ def _by_mujoco(
     measure_growth: bool,
 ) -> Trajectory:
     """Return C MuJoCo's rollout under controls, noise included, or a policy; the last good state is held."""
+    given, state = state, complete(scene, state)
     if not callable(controls):
         found = _course(scene, state, controls, inputs, gradient)
     else:
@@ -271,15 +272,19 @@ def _by_mujoco(
             one = _course(scene, state, ctrl[None], jax.tree.map(lambda x: x[None], row), gradient)
             first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
             moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
-            return (moved, first_bad), (state, ctrl)
+            return (moved, first_bad), ((state.qpos, state.qvel, state.act), ctrl)
 
         # Step by step, since each control depends on the state before it.
         rows = (jnp.arange(len(noise), dtype=jnp.int32), noise, inputs)
         (final, first_bad), (states, ctrl) = jax.lax.scan(advance, (state, jnp.int32(-1)), rows)
-        states = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), states, final)
-        found = _trajectory(states, ctrl, first_bad)
+        last = (final.qpos, final.qvel, final.act)
+        states = [jnp.concatenate([x, end[None]]) for x, end in zip(states, last, strict=True)]
+        found = _trajectory(states, final, ctrl, first_bad)
     growth = _growth(scene, state, found.ctrl, inputs, gradient) if measure_growth else None
-    return dataclasses.replace(found, growth=growth)
+    # What a scan carries has to look as it did.
+    final = found.final if given.pairs is not None else dataclasses.replace(found.final, pairs=None)
+    final = final if given.history.size == final.history.size else dataclasses.replace(final, history=given.history)
+    return dataclasses.replace(found, growth=growth, final=final)
 
 
 @eqx.filter_jit
@@ -289,22 +294,28 @@ def _course(
     """Return the motion under known controls: one call of C MuJoCo."""
     is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
     start, resting = arguments.arguments_of(scene, state)
+    assert state.pairs is not None
+    start |= {"warmstart": state.warmstart, "flight": state.pairs.flight, "held": state.pairs.held}
     given = {name: jnp.broadcast_to(value, (len(ctrl), *value.shape)) for name, value in resting.items()}
     found = roll_out(scene, start, given | inputs | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
-    begin = (state.qpos, state.qvel, state.act)
-    qpos, qvel, act = (jnp.concatenate([first[None], rest]) for first, rest in zip(begin, found, strict=True))
-    time = state.time + scene.model.opt.timestep * jnp.arange(len(ctrl) + 1)
-    states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
-    is_bad = ~(jax.vmap(is_sound)(states)[1:] & jnp.all(is_finite, axis=1))
+    qpos, qvel, act = (jnp.concatenate([getattr(state, k)[None], found[k]]) for k in ("qpos", "qvel", "act"))
+    history = jnp.concatenate([state.history[None], jnp.concatenate([found["history"], found["plugin"]], axis=1)])
+    is_good = jax.vmap(is_sound)(qpos, qvel, act)
+    is_bad = ~(is_good[1:] & jnp.all(is_finite, axis=1))
     first_bad = jnp.where(jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32), -1)
     kept = jnp.arange(len(ctrl) + 1)
     kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
-    return _trajectory(jax.tree.map(lambda x: x[kept], states), ctrl, first_bad)
+    qpos, qvel, act, history = (x[kept] for x in (qpos, qvel, act, history))
+    time = state.time + scene.model.opt.timestep * kept[-1]
+    pairs = Pairs(found["flight"], found["held"])
+    pairs = jax.tree.map(lambda x: jnp.where(first_bad >= 0, 0.0, x), pairs)
+    final = State(qpos[-1], qvel[-1], act[-1], time, found["warmstart"], history[-1], pairs)
+    return _trajectory((qpos, qvel, act), final, ctrl, first_bad)
 
 
-def _trajectory(states: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]) -> Trajectory:
-    final = jax.tree.map(lambda x: x[-1], states)
-    return Trajectory(states.qpos, states.qvel, ctrl, None, final, first_bad >= 0, first_bad, act=states.act)  # pyright: ignore[reportCallIssue]
+def _trajectory(states: Sequence[Array], final: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]) -> Trajectory:
+    qpos, qvel, act = states
+    return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act)  # pyright: ignore[reportCallIssue]
 
 
 def _growth(scene: Scene, state: State, ctrl: Array, inputs: _Inputs, gradient: Gradient) -> Float[Array, ""]:

@@ -1,5 +1,6 @@
 """States and trajectories, initial states, and checks of a pose and of a rollout."""
 
+import dataclasses
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -13,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PyTree
 from mjxgrad._arrays import instance, is_known, known, real
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.parameters import geom_name
+from mjxgrad.engines import MOTION, engine_of
 from mjxgrad.scene import Scene, SceneWarning
 
 VELOCITY_LIMIT = 1e4  # m/s or rad/s, beyond which a rollout counts as diverged
@@ -21,6 +23,18 @@ _DEEP = 0.02  # m, largest penetration of a pose without a warning
 _NO_LIMITS = mujoco.mjtDisableBit.mjDSBL_LIMIT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
 LARGEST_GROWTH = 1e3
 """Growth of a tangent that counts as exploding. In half a second of free motion 1 m/s becomes 0.5 m; a bounce reduces it."""
+
+
+class Pairs(eqx.Module):
+    """Pairs of motions that a slope by C MuJoCo follows, see `engines.flight`; empty where nothing is differentiated.
+
+    Attributes:
+        flight: both motions of each, as changes of the state, how far apart they began, and how they are followed.
+        held: zeros, whose derivative is what each pair has felt of a change.
+    """
+
+    flight: Float[Array, "slots numbers"]
+    held: Float[Array, " slots"]
 
 
 class State(eqx.Module):
@@ -32,6 +46,8 @@ class State(eqx.Module):
         act: actuator activations.
         time: simulated time (s).
         warmstart: acceleration at which the next solve starts. It affects the solve's duration, not its result.
+        history: of actuators and sensors with a delay, and states of plugins; as MuJoCo keeps them.
+        pairs: what a slope by C MuJoCo goes on with; None where MJX steps the scene.
     """
 
     qpos: Float[Array, " nq"]
@@ -39,6 +55,8 @@ class State(eqx.Module):
     act: Float[Array, " na"]
     time: Float[Array, ""]
     warmstart: Float[Array, " nv"]
+    history: Float[Array, " nhistory"] = eqx.field(default_factory=lambda: jnp.zeros(0))
+    pairs: Pairs | None = None
 
 
 class Trajectory(eqx.Module):
@@ -115,7 +133,18 @@ def initial_state(
         parts.append(part)
     for message in pose_warnings(scene.model, scene.mj_model if qpos is None else None, parts[0]):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    return State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
+    state = State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
+    return complete(scene, state) if scene.engine == "mujoco" else state
+
+
+def complete(scene: Scene, state: State) -> State:
+    """Return a state with all that C MuJoCo goes on with: histories as they are at first, no pairs, unless it has some."""
+    engine, dtype = engine_of(scene.mj_model), state.qpos.dtype
+    first = np.concatenate([engine.first[name] for name in MOTION[3:]])
+    history = state.history if state.history.size == first.size else jnp.asarray(first, dtype)
+    nothing = [jnp.zeros(shape, dtype) for shape in (engine.flight_shape, engine.flight_shape[:1])]
+    pairs = Pairs(*nothing) if state.pairs is None else state.pairs
+    return dataclasses.replace(state, history=history, pairs=pairs)
 
 
 def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:
@@ -174,11 +203,10 @@ def state_of(data: mjx.Data) -> State:
     return State(data.qpos, data.qvel, data.act, data.time, data.qacc_warmstart)
 
 
-def is_sound(state: State) -> Bool[Array, ""]:
+def is_sound(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], act: Float[Array, " na"]) -> Bool[Array, ""]:
     """Return whether a state is finite and below the velocity limit."""
-    numbers = jnp.concatenate([state.qpos, state.act])
     # A comparison with NaN is false, so one test finds both.
-    return jnp.all(jnp.isfinite(numbers)) & jnp.all(jnp.abs(state.qvel) < VELOCITY_LIMIT)
+    return jnp.all(jnp.isfinite(jnp.concatenate([qpos, act]))) & jnp.all(jnp.abs(qvel) < VELOCITY_LIMIT)
 
 
 def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:

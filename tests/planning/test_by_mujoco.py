@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.native.engine import Engine
+from mjxgrad.engines.mujoco import Engine
 from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, SceneSystem
 from mjxgrad.planning.trajectory import Course, Feedback, Problem
 

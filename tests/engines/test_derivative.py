@@ -10,7 +10,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.bodies.kinematics import integrate_position
-from mjxgrad.native.engine import engine_of
+from mjxgrad.engines.mujoco import engine_of
 from mjxgrad.stepping import own_motion
 from mjxgrad.tasks import scene_path
 

@@ -9,8 +9,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
-from mjxgrad.native.engine import Engine
-from mjxgrad.native.events import Surfaces, _by_modes, levers_of
+from mjxgrad.engines.mujoco import Engine
+from mjxgrad.engines.events import Surfaces, _by_modes, levers_of
 from tests.scenes import ASSETS
 
 BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">

@@ -118,7 +118,7 @@ class Near:
 
     Attributes:
         events: those that the step may begin or end, or None.
-        is_rough: whether a contact acts, or may, at a body with edges or corners.
+        rough: the velocities that move one body of a contact that acts, or may, where a body has edges or corners.
         is_undecided: whether rounding decides if a contact or limit acts.
         rows: J of the other contacts and limits whose force begins with a jump.
         gaps: their gaps (m or rad).
@@ -126,11 +126,15 @@ class Near:
     """
 
     events: Events | None
-    is_rough: bool
+    rough: Int[np.ndarray, " some"]
     is_undecided: bool
     rows: Float[np.ndarray, "others nv"]
     gaps: Float[np.ndarray, " others"]
     lengths: Float[np.ndarray, " nv"]
+
+    @property
+    def is_rough(self) -> bool:
+        return len(self.rough) > 0
 
     def width(self, change: Float[np.ndarray, " nv"]) -> float:
         """Return by how many times a displacement moves a body's farthest point a hair's breadth, across no surface."""
@@ -146,19 +150,22 @@ class Surfaces:
         self, model: mujoco.MjModel, levers: Float[np.ndarray, "nbody nv"], speeds: Float[np.ndarray, "states nv"]
     ):
         """Widen all margins by what states of these speeds travel in half a step, at most."""
-        self.lengths, self.timestep = levers.max(axis=0), model.opt.timestep
+        self.lengths, self.timestep, self.is_moved = levers.max(axis=0), model.opt.timestep, levers > 0
         self.longest = max(1.0, self.lengths.max(initial=0.0))
         self.kept = kept_by_damping(model)
         # How far ahead of the start of a step its stages lie, in the mean (s).
         self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
-        travel = (0.5 * self.timestep + 2 * self.lead) * np.max(np.abs(speeds), axis=0, initial=0.0)
-        least = _LEAST_WIDTH * _USUAL_WIDTH
-        self.contact_reach = float(np.sort(levers @ travel)[-2:].sum()) + least
-        self.limit_reach = float(travel.sum() * self.longest) + least
+        self.levers = levers
+        self.contact_reach, self.limit_reach = self._reach(np.max(np.abs(speeds), axis=0, initial=0.0))
         # The last entry is for -1, the vertices of flexible bodies.
         self.is_rough = np.append(~np.isin(model.geom_type, _SMOOTH), False)
         self.model = widened(model, self.contact_reach, self.limit_reach)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+
+    def _reach(self, speed: Float[np.ndarray, " nv"]) -> tuple[float, float]:
+        """Return how far contacts and limits travel in half a step at most."""
+        travel, least = (0.5 * self.timestep + 2 * self.lead) * speed, _LEAST_WIDTH * _USUAL_WIDTH
+        return float(np.sort(self.levers @ travel)[-2:].sum()) + least, float(travel.sum() * self.longest) + least
 
     def beside(self, change: float, data: mujoco.MjData) -> tuple[Float[np.ndarray, " nv"] | None, bool]:
         """Return the displacement after which changes of this size cross no surface, or None, and whether rounding decides."""
@@ -185,6 +192,9 @@ class Surfaces:
         if not data.nefc:
             return None
         is_rough, rows, gaps, least, jumps = self._gaps(data)
+        is_contact = np.arange(len(rows)) < np.count_nonzero(np.asarray(data.contact.efc_address) >= 0)
+        # What is near one state may not depend on how fast others move.
+        gaps = np.where(gaps < np.where(is_contact, *self._reach(np.abs(before))), gaps, np.inf)
         rate, centres = rows @ before, np.zeros(len(rows))
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
         if self.lead:
@@ -199,12 +209,23 @@ class Surfaces:
         chosen = (np.abs(gaps - centres) < widths) & jumps
         events = None
         if chosen.any():
-            is_contact = np.arange(len(rows)) < np.count_nonzero(np.asarray(data.contact.efc_address) >= 0)
             is_met = np.abs(gaps) < self.timestep * np.abs(rate)
-            times = np.where(is_met, -gaps / np.where(is_met, rate, 1.0), 0.0)
+            times = -np.where(is_met, gaps, 0.0) / np.where(is_met, rate, 1.0)
             events = _by_modes(rows, gaps, centres, widths, times, chosen, is_contact, self.lengths)
-        others = jumps & ~chosen  # a force that begins without a jump may be crossed
-        return Near(events, bool(is_rough.any()), bool(is_undecided.any()), rows[others], gaps[others], self.lengths)
+        others = jumps & ~chosen & np.isfinite(gaps)  # a force that begins without a jump may be crossed
+        return Near(events, self._movers(data, is_rough), bool(is_undecided.any()), rows[others], gaps[others], self.lengths)
+
+    def _movers(self, data: mujoco.MjData, is_rough: _Mask) -> Int[np.ndarray, " some"]:
+        """Return the velocities that move one body of a chosen contact and not the other."""
+        if not is_rough.any():
+            return np.zeros(0, int)
+        contact = data.contact
+        geoms = np.asarray(contact.geom).reshape(-1, 2)[np.asarray(contact.efc_address) >= 0]
+        chosen = geoms[is_rough[: len(geoms)]]
+        if (chosen < 0).any():
+            return np.arange(self.model.nv)
+        first, second = self.is_moved[self.model.geom_bodyid[chosen]].swapaxes(0, 1)
+        return np.flatnonzero((first != second).any(axis=0))
 
     def _moves(self, rows: _Rows) -> _Mask:
         """Return which rows some coordinate moves."""
@@ -332,7 +353,7 @@ def _by_modes(
     apart = _independent(every @ scaled[index], np.zeros((0, scaled.shape[1])))
     weights, label, width = every[apart], np.array(groups)[apart], np.array(widest)[apart]
     mode = weights @ scaled[index]
-    to_middle = np.where(label[:, None] == label, (weights @ (centres - gaps)[index])[:, None], 0.0)
+    to_middle = np.where(label[:, None] == label, (weights @ (centres[index] - gaps[index]))[:, None], 0.0)
     held = np.zeros(0, int)
     while True:
         kept = held[_independent(scaled[held], mode)]

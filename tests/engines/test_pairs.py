@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from mjxgrad.native.engine import PAIRS, _through
+from mjxgrad.engines.mujoco import PAIRS, _through
 from mjxgrad.native.pairs import Pair, settle
 
 MODEL = mujoco.MjModel.from_xml_string("<mujoco/>")

@@ -1,0 +1,206 @@
+r"""Two motions from either side of an event, followed while the derivative along the motion does not say how they differ.
+
+A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
+steps both have been, and differ little. Between, the outcome's change is D_j h, with D_j the difference of the two motions after j
+steps over their distance before, and h the share of that distance by which a change moves the event. Changes go two ways:
+
+    x' = A x + b,        h' = keep (h + slots (F x + f)),        whole change = x' + D h'.
+
+A is the derivative along the motion without events, F what each event that begins feels. A pair that is let go joins x.
+
+- **Explained.** A pair is explained after three steps in a row in which D' is A D to a twentieth. An event between the two adds its
+  jump to A D, if they lie to either side of it; if they do not, it adds what a small difference does. Either explains.
+- **Let go.** It is let go once explained, and if it is at most ten times as far apart as at first; or, where an event is met, if it
+  is less far apart than the event's own window: that event then has a better mean of its phases than two motions have. Motions that
+  are farther apart span many phases of the next event, and a derivative would multiply there. After a hundred steps it is let go.
+- **Slots.** A motion has room for a number of pairs; where it lacks, the pair that is least apart is let go.
+
+A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
+a difference of two motions is not.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mjxgrad.engines.layout import Layout
+
+# Let go after one step that is alike, a rolling ball's derivatives scatter twice as far. Of a falling arm that bounces twice,
+# four keep both motions until the second bounce, which then is not averaged over its own phases.
+_NUM_ALIKE, _ALIKE = 3, 0.05
+_FAR = 10.0  # times the distance at first; a falling arm that bounces twice is off with 5
+_LONGEST = 100
+NUM_SLOTS = 24
+_STEPS = 10  # over which a difference of velocities is one of positions
+
+
+@dataclass
+class Begun:
+    """Pairs that begin in a step, one for each mode of its events.
+
+    Attributes:
+        felt: F, by a change.
+        ends: both motions after the step.
+        widths: how far apart each pair began.
+        apart: D after the step.
+        lost: what small differences have along the displacements that events replace.
+        longest: after how many steps these pairs are let go in any case.
+        by_others: F, by each entry of what else moves gaps.
+    """
+
+    felt: Float[np.ndarray, "modes size"]
+    ends: Float[np.ndarray, "modes 2 motion"]
+    widths: Float[np.ndarray, " modes"]
+    apart: Float[np.ndarray, "modes size"]
+    lost: Float[np.ndarray, "size modes"] | None = None
+    longest: int = _LONGEST
+    by_others: dict[str, Float[np.ndarray, "modes entries"]] = field(default_factory=dict)
+
+
+@dataclass
+class Flight:
+    """Pairs in flight, of a batch of motions."""
+
+    ends: Float[np.ndarray, "motions slots 2 motion"]
+    widths: Float[np.ndarray, "motions slots"]
+    left: Int[np.ndarray, "motions slots"]
+    alike: Int[np.ndarray, "motions slots"]
+    apart: Float[np.ndarray, "motions slots size"]
+
+    @classmethod
+    def unpacked(
+        cls, packed: Float[np.ndarray, "motions slots numbers"], layout: Layout, rows: Float[np.ndarray, "motions size"]
+    ) -> "Flight":
+        """Return a flight from its numbers, beside whole states."""
+        size = layout.num_changes
+        widths, left, alike = np.moveaxis(packed[..., 2 * size :], -1, 0)
+        ends = np.zeros((*widths.shape, 2, len(layout.motion)))
+        apart = np.zeros((*widths.shape, size))
+        if (live := widths > 0).any():
+            motions, slots = np.nonzero(live)
+            away = packed[motions, slots, : 2 * size].reshape(-1, 2, size)
+            both = layout.moved(rows[motions][:, None], away)
+            ends[motions, slots] = both[..., layout.motion]
+            apart[motions, slots] = layout.difference(both[:, 0], both[:, 1]) / widths[live][:, None]
+        return cls(ends, widths.copy(), left.astype(int), alike.astype(int), apart)
+
+    def packed(self, layout: Layout, rows: Float[np.ndarray, "motions size"]) -> Float[np.ndarray, "motions slots numbers"]:
+        """Return all in one array, with both ends as changes of whole states, which single precision does not round away."""
+        size = layout.num_changes
+        found = np.zeros((*self.widths.shape, 2 * size + 3))
+        if (live := self.widths > 0).any():
+            motions, slots = np.nonzero(live)
+            both = np.repeat(rows[motions][:, None], 2, axis=1)
+            both[..., layout.motion] = self.ends[motions, slots]
+            found[motions, slots, : 2 * size] = layout.difference(both, rows[motions][:, None]).reshape(len(motions), -1)
+            found[motions, slots, 2 * size :] = np.stack([self.widths, self.left, self.alike], axis=-1)[live]
+        return found
+
+
+@dataclass(frozen=True)
+class Course:
+    """Steps of a batch of motions: their states, what their events begin, and derivatives without events."""
+
+    rows: Float[np.ndarray, "motions steps size"]
+    matrices: Float[np.ndarray, "motions steps size size"]
+    begun: Mapping[tuple[int, int], Begun]
+    models: Callable[[int, int], mujoco.MjModel]
+    is_finite: Bool[np.ndarray, "motions steps"]
+
+
+def fly(
+    flight: Flight,
+    course: Course,
+    layout: Layout,
+    lengths: Float[np.ndarray, " nv"],
+    timestep: float,
+    step: Callable[[np.ndarray, list[mujoco.MjModel]], np.ndarray],
+    found: Mapping[str, np.ndarray],
+) -> None:
+    """Take pairs through all steps of a course, and write what the recursion needs.
+
+    Args:
+        flight: what is in flight before; it is left as it is after the last step.
+        course: the motions that it is beside.
+        layout: of states.
+        lengths: how far each velocity moves the farthest point of its bodies.
+        timestep: h (s).
+        step: function from states and models to the motions after a step.
+        found: "felt", "slot", "apart" and "stays" with axes of motions and steps; "before" and "enters", without steps.
+    """
+    scale = np.concatenate([lengths, _STEPS * timestep * lengths, np.zeros(layout.num_rest)])
+    num, steps = course.rows.shape[:2]
+    by_step: dict[int, list[int]] = {}
+    for motion, t in course.begun:
+        by_step.setdefault(t, []).append(motion)
+    for t in range(steps):
+        live, starting = flight.widths > 0, by_step.get(t, ())
+        if live.any():
+            size = np.linalg.norm(scale * flight.apart, axis=-1)
+            known = flight.alike >= _NUM_ALIKE
+            live &= (flight.left > 0) & ~(known & (size <= _FAR))
+            for motion in starting:
+                near = known[motion] & live[motion]
+                if near.any():
+                    one = course.begun[motion, t]
+                    reach = np.abs(one.felt @ flight.apart[motion].T) * flight.widths[motion]
+                    live[motion] &= ~(near & (reach <= one.widths[:, None]).all(axis=0))
+        slots = {}
+        for motion in starting:
+            count, free = len(course.begun[motion, t].widths), np.flatnonzero(~live[motion])
+            if len(free) < count:
+                held = np.flatnonzero(live[motion])
+                order = np.argsort(np.linalg.norm(scale * flight.apart[motion, held], axis=-1))
+                free = np.concatenate([free, held[order[: count - len(free)]]])
+                live[motion, free] = False
+            slots[motion] = free[:count]
+        if t:
+            found["stays"][:, t - 1] = live
+        else:
+            found["before"][:], found["enters"][:] = np.swapaxes(flight.apart * live[..., None], -1, -2), live
+        flight.widths[~live] = 0.0
+        if live.any():
+            _advance(flight, live, course, t, layout, scale, step)
+        for motion, chosen in slots.items():
+            one = course.begun[motion, t]
+            count = len(chosen)
+            flight.ends[motion, chosen], flight.widths[motion, chosen] = one.ends[:count], one.widths[:count]
+            flight.left[motion, chosen], flight.alike[motion, chosen] = one.longest - 1, 0
+            flight.apart[motion, chosen] = one.apart[:count]
+            found["slot"][motion, t, :count], found["felt"][motion, t, :count] = chosen, one.felt[:count]
+            for name, share in one.by_others.items():
+                found[f"felt {name}"][motion, t, :count] = share[:count]
+        found["apart"][:, t] = np.swapaxes(np.where(flight.widths[..., None] > 0, flight.apart, 0.0), -1, -2)
+    found["stays"][:, -1] = flight.widths > 0
+
+
+def _advance(
+    flight: Flight, live: np.ndarray, course: Course, t: int, layout: Layout, scale: np.ndarray, step: Callable
+) -> None:
+    """Take both motions of each pair through a step, and see whether derivatives say how they differ."""
+    motions, slots = np.nonzero(live)
+    rows = np.repeat(course.rows[motions, t][:, None], 2, axis=1)
+    rows[..., layout.motion] = flight.ends[motions, slots]
+    models = [course.models(motion, t) for motion in motions.tolist() for _ in range(2)]
+    ends = step(rows.reshape(-1, rows.shape[-1]), models).reshape(len(motions), 2, -1)
+    rows[..., layout.motion] = ends
+    with np.errstate(invalid="ignore"):
+        apart = layout.difference(rows[:, 0], rows[:, 1]) / flight.widths[motions, slots][:, None]
+    before = flight.apart[motions, slots]
+    expected = (course.matrices[motions, t] @ before[..., None])[..., 0]
+    off = np.linalg.norm(scale * (apart - expected), axis=-1)
+    for k, motion in enumerate(motions.tolist()):
+        if (one := course.begun.get((motion, t))) is not None:
+            felt = one.felt @ before[k]
+            ways = [one.apart.T @ felt] + ([] if one.lost is None else [one.lost @ felt])
+            off[k] = min(np.linalg.norm(scale * (apart[k] - expected[k] - way)) for way in ways)
+    is_sound = np.isfinite(apart).all(axis=-1) & course.is_finite[motions, t]
+    known = off <= _ALIKE * np.linalg.norm(scale * apart, axis=-1)
+    flight.alike[motions, slots] = np.where(known, flight.alike[motions, slots] + 1, 0)
+    flight.left[motions, slots] -= 1
+    flight.ends[motions, slots] = np.where(is_sound[:, None, None], ends, 0.0)
+    flight.apart[motions, slots] = np.where(is_sound[:, None], apart, 0.0)
+    flight.widths[motions, slots] *= is_sound

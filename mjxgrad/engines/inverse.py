@@ -1,0 +1,317 @@
+r"""The derivative of a step of C MuJoCo from its solution.
+
+A step solves R(q, v, a; ...) = 0 for the mean acceleration a = (v' - v)/h, with R inverse dynamics less what acts: inertia, bias,
+passive forces, constraints (contacts, limits, friction), less actuators and applied forces. R is an explicit function, so
+
+    ∂a/∂x = -(∂R/∂a)⁻¹ ∂R/∂x,     v' = v + h a,     q' = q ⊕ h v',
+
+and no difference contains an iteration of a solver: nothing that its tolerance leaves is divided by a width. `mj_inverse` with
+`mjENBL_INVDISCRETE` is R for all integrators but Runge-Kutta. Differences by velocities, accelerations, activations and controls
+need no kinematics and no collisions.
+
+- **Width.** R is as exact as rounding, so positions move by 2⁻³⁰ (m or rad) to one side: centred differences of 1e-6 are as far off
+  (1e-6 of the largest entry on legged robots), and meet a thousand times as many surfaces. Without constraints they move by 2⁻²⁶.
+  Shapes whose contacts are found by iterations, to 1e-6, are moved by 1e-6 to both sides.
+- **Actuators.** Each force depends on the actuator's own length, velocity, control and activations, so all are changed at once,
+  and the moment arms carry the result. Where the integrator's matrix depends on controls (muscles, gains by velocity), where
+  joints or tendons limit forces, or actuators are coupled, each is changed alone, and R is taken anew.
+- **What has no R**: Runge-Kutta, noslip, delays, plugins, and steps whose residual is not zero. See `engines.differences`.
+
+`mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by up to a
+quarter there.
+
+References:
+    Todorov. Convex and analytically-invertible dynamics with contacts and constraints. ICRA 2014.
+"""
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjxgrad.engines.layout import EVERY, Layout
+
+_NARROW, _FREE = 2.0**-30, 2.0**-26  # m or rad, with and without constraints; powers of two change a number by just that
+_WIDTH = 1e-6  # of all but positions; of parameters as a share of their value
+_PUSH = 1e-5  # m/s² or rad/s², by which R is nearly linear: forces have kinks where friction reaches its cone
+_RESIDUAL = 1e-6  # of the largest force, above which a step has no R that is zero
+_TINY = 1e-30
+_VELOCITY = mujoco.mjtStage.mjSTAGE_POS.value  # the stage that is done: velocities are next
+_ROUND = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
+_OWN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
+# Those whose matrix has the derivatives of forces by velocity; the last is known to later releases alone.
+_IMPLICIT = tuple(
+    getattr(mujoco.mjtIntegrator, f"mjINT_{name}").value
+    for name in ("IMPLICIT", "IMPLICITFAST", "DISCRETE")
+    if hasattr(mujoco.mjtIntegrator, f"mjINT_{name}")
+)
+_BY_POTENTIAL = getattr(mujoco.mjtEnableBit, "mjENBL_IPC", 0)
+
+
+def has_inverse(model: mujoco.MjModel) -> bool:
+    """Return whether inverse dynamics has all that a step of this model does."""
+    opt = model.opt
+    is_staged = opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    is_other = opt.enableflags & int(_BY_POTENTIAL)
+    return not (is_staged or is_other or opt.noslip_iterations or model.nhistory or model.nplugin)
+
+
+class Inverse:
+    """R of one model and its derivatives, with memory of its own; `model` is solved to the end and may be changed."""
+
+    def __init__(self, model: mujoco.MjModel, layout: Layout):
+        self.model, self.layout, self.data = model, layout, mujoco.MjData(model)
+        model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_INVDISCRETE
+        data, self.moment = self.data, np.zeros((model.nu, model.nv))
+        self.qpos, self.qvel, self.qacc, self.act, self.ctrl = data.qpos, data.qvel, data.qacc, data.act, data.ctrl
+        self.low, self.high = np.where(np.asarray(model.actuator_ctrllimited, bool)[:, None], model.actuator_ctrlrange, [[-np.inf, np.inf]]).T
+        depends = model.actuator_gaintype != mujoco.mjtGain.mjGAIN_FIXED
+        is_coupled = bool(
+            (~np.isin(model.actuator_gaintype, _OWN_GAINS)).any()
+            or model.jnt_actfrclimited.any()
+            or model.tendon_actfrclimited.any()
+            or (model.opt.integrator in _IMPLICIT and depends.any())
+        )
+        self.is_coupled, self.is_iterative = is_coupled, not np.isin(model.geom_type, _ROUND).all()
+        of_act = np.zeros(model.na, int)
+        order = np.zeros(model.na, int)
+        for actuator, (first, count) in enumerate(zip(model.actuator_actadr, model.actuator_actnum, strict=True)):
+            if count > 0:
+                of_act[first : first + count], order[first : first + count] = actuator, np.arange(count)
+        self.of_act, self.order = of_act, order
+
+    def residual(self, skip: int = 0) -> Float[np.ndarray, " nv"]:
+        """Return inverse dynamics less actuators of what is in `data`; stages before may be skipped."""
+        model, data = self.model, self.data
+        mujoco.mj_inverseSkip(model, data, skip, 1)
+        found = data.qfrc_inverse.copy()
+        if model.nu:
+            mujoco.mj_fwdActuation(model, data)
+            found -= data.qfrc_actuator
+        return found
+
+    def applied(self) -> Float[np.ndarray, " nv"]:
+        """Return applied forces at the position in `data`."""
+        data, found = self.data, self.data.qfrc_applied.copy()
+        for body in np.flatnonzero(data.xfrc_applied.any(axis=1)).tolist():
+            force, torque = np.split(data.xfrc_applied[body], 2)
+            mujoco.mj_applyFT(self.model, data, force, torque, data.xipos[body], body, found)
+        return found
+
+    def blocks(self, row: np.ndarray, acceleration: np.ndarray, found: dict[str, np.ndarray]) -> bool:
+        """Write the derivatives of R, inputs first, at a state and its acceleration; return whether R is zero there.
+
+        Args:
+            row: the state.
+            acceleration: a of the step from there.
+            found: "qpos", "qvel", "qacc" of R; "act" and "ctrl", where there are such, of R and, as "next ...", of activations.
+        """
+        model, data = self.model, self.data
+        mujoco.mj_setState(model, data, row, EVERY)
+        self.qacc[:] = acceleration
+        nothing = [None] * 6
+        self._by_position(found["qpos"])
+        mujoco.mjd_inverseFD(model, data, _WIDTH, True, None, found["qvel"], *nothing[:5])
+        mujoco.mjd_inverseFD(model, data, _PUSH, True, None, None, found["qacc"], *nothing[:4])
+        if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and data.ncon:
+            mujoco.mjd_inverseFD(model, data, -_PUSH, True, None, None, other := np.empty_like(found["qacc"]), *nothing[:4])
+            found["qacc"] += other
+            found["qacc"] *= 0.5
+        # The last difference moved accelerations alone.
+        self.qacc[:] = acceleration
+        at = self.residual(_VELOCITY)
+        if model.nu or model.na:
+            (self._one_by_one if self.is_coupled else self._all_at_once)(found)
+            mujoco.mj_setState(model, data, row, EVERY)
+        if data.xfrc_applied.any():
+            self._by_applied(found["qpos"])
+        size = max(np.abs(data.qfrc_bias).max(), np.abs(data.qfrc_constraint).max(), np.abs(data.qfrc_inverse).max(), 1e-9)
+        return bool(np.abs(at - self.applied()).max() <= _RESIDUAL * size)
+
+    def _by_position(self, found: np.ndarray) -> None:
+        model, data = self.model, self.data
+        if not self.is_iterative:
+            mujoco.mjd_inverseFD(model, data, _NARROW if data.nefc else _FREE, True, found, *[None] * 6)
+            return
+        mujoco.mjd_inverseFD(model, data, _WIDTH, True, found, *[None] * 6)
+        mujoco.mjd_inverseFD(model, data, -_WIDTH, True, other := np.empty_like(found), *[None] * 6)
+        found += other
+        found *= 0.5
+
+    def _by_applied(self, found: np.ndarray) -> None:
+        """Take what positions change of forces that are applied to bodies."""
+        model, data = self.model, self.data
+        for dof in range(model.nv):
+            ends = []
+            for side in (_WIDTH, -_WIDTH):
+                before = self.qpos.copy()
+                mujoco.mj_integratePos(model, self.qpos, side * np.eye(1, model.nv, dof)[0], 1.0)
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                ends.append(self.applied())
+                self.qpos[:] = before
+            found[dof] -= (ends[0] - ends[1]) / (2 * _WIDTH)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+
+    def _next(self) -> np.ndarray:
+        """Return the activations after the step, and leave the state as it was."""
+        kept = [one.copy() for one in (self.qpos, self.qvel, self.act)]
+        mujoco.mj_Euler(self.model, self.data)
+        end = self.act.copy()
+        self.qpos[:], self.qvel[:], self.act[:] = kept
+        return end
+
+    def sides(self, ctrl: np.ndarray, width: float, index: np.ndarray | int | slice = slice(None)) -> tuple[np.ndarray, ...]:
+        """Return controls moved up and down, those within their limits no farther, and the distances between."""
+        low, high, up, down = self.low[index], self.high[index], ctrl + width, ctrl - width
+        is_inside = (ctrl >= low) & (ctrl <= high)
+        up, down = np.where(is_inside, np.minimum(up, high), up), np.where(is_inside, np.maximum(down, low), down)
+        return up, down, np.maximum(up - down, _TINY)
+
+    def at(self, row: np.ndarray, acceleration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return R and the next activations at a state and an acceleration."""
+        mujoco.mj_setState(self.model, self.data, row, EVERY)
+        self.qacc[:] = acceleration
+        found = self.residual() - self.applied()
+        return found, self._next() if self.model.na else self.act.copy()
+
+    def solutions(
+        self, row: np.ndarray, acceleration: np.ndarray, matrix: np.ndarray, places: Float[np.ndarray, "places nq"]
+    ) -> Float[np.ndarray, "places nv"]:
+        """Return the accelerations that solve R = 0 at other positions, by Newton's method with the derivative at hand.
+
+        Two steps: the first follows the geometry, the second takes what forces then have beyond their linear change.
+        """
+        model, data, found = self.model, self.data, []
+        inverse = np.linalg.inv(matrix.T)
+        mujoco.mj_setState(model, data, row, EVERY)
+        for place in places:
+            self.qpos[:], self.qacc[:] = place, acceleration
+            self.qacc -= inverse @ (self.residual() - (force := self.applied()))
+            self.qacc -= inverse @ (self.residual(_VELOCITY) - force)
+            found.append(self.qacc.copy())
+        return np.array(found)
+
+    def _all_at_once(self, found: dict[str, np.ndarray]) -> None:
+        model, data = self.model, self.data
+        mujoco.mju_sparse2dense(self.moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+
+        def changes(entry: np.ndarray, index: np.ndarray, *, is_ctrl: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+            """Return the derivatives of forces and of next activations, each by its own actuator's entry."""
+            kept, ends = entry[index].copy(), []
+            if is_ctrl:
+                up, down, width = self.sides(kept, _WIDTH, index)
+            else:
+                up, down, width = kept + _WIDTH, kept - _WIDTH, np.full(len(kept), 2 * _WIDTH)
+            for value in (up, down):
+                entry[index] = value
+                mujoco.mj_fwdActuation(model, data)
+                ends.append((data.actuator_force.copy(), self._next() if model.na else None))
+            entry[index] = kept
+            by_force = np.zeros(model.nu)
+            owner = self.of_act[index] if entry is self.act else index
+            by_force[owner] = (ends[0][0] - ends[1][0])[owner] / width
+            if not model.na:
+                return by_force, None
+            per_act = np.zeros(model.nu)
+            per_act[owner] = width
+            return by_force, (ends[0][1] - ends[1][1]) / np.maximum(per_act[self.of_act], 1e-30) * (per_act[self.of_act] > 0)
+
+        every = np.arange(model.nu)
+        by_force, of_next = changes(self.ctrl, every, is_ctrl=True)
+        found["ctrl"][:] = -by_force[:, None] * self.moment
+        if not model.na:
+            return
+        acts = np.arange(model.na)
+        found["next ctrl"][:] = 0.0
+        found["next ctrl"][self.of_act, acts] = of_next
+        found["act"][:] = found["next act"][:] = 0.0
+        for number in range(self.order.max() + 1):
+            chosen = np.flatnonzero(self.order == number)
+            by_force, of_next = changes(self.act, chosen)
+            found["act"][chosen] = -by_force[self.of_act[chosen], None] * self.moment[self.of_act[chosen]]
+            for one in chosen:
+                own = np.flatnonzero(self.of_act == self.of_act[one])
+                found["next act"][one, own] = of_next[own]
+        for name, entry in (("qpos", data.actuator_length), ("qvel", data.actuator_velocity)):
+            _, of_next = changes(entry, every)
+            found[f"next {name}"][:] = (of_next[:, None] * self.moment[self.of_act]).T
+
+    def _one_by_one(self, found: dict[str, np.ndarray]) -> None:
+        model, data = self.model, self.data
+
+        def evaluated() -> tuple[np.ndarray, np.ndarray]:
+            force = self.residual(_VELOCITY)
+            return force, self._next() if model.na else np.zeros(0)
+
+        for name, entry in (("ctrl", self.ctrl), ("act", self.act)):
+            for k in range(len(entry)):
+                kept, ends = entry[k], []
+                is_ctrl = name == "ctrl"
+                up, down, width = self.sides(kept, _WIDTH, k) if is_ctrl else (kept + _WIDTH, kept - _WIDTH, 2 * _WIDTH)
+                for value in (up, down):
+                    entry[k] = value
+                    ends.append(evaluated())
+                entry[k] = kept
+                found[name][k] = (ends[0][0] - ends[1][0]) / width
+                if model.na:
+                    found[f"next {name}"][k] = (ends[0][1] - ends[1][1]) / width
+        if model.na:
+            self._activations_by_motion(found)
+
+    def _activations_by_motion(self, found: dict[str, np.ndarray]) -> None:
+        """Write the derivatives of next activations by position and velocity, of coupled actuators, too."""
+        model, data = self.model, self.data
+        for name in ("qpos", "qvel"):
+            for dof in range(model.nv):
+                ends = []
+                for side in (_WIDTH, -_WIDTH):
+                    kept = self.qpos.copy(), self.qvel.copy()
+                    if name == "qpos":
+                        mujoco.mj_integratePos(model, self.qpos, side * np.eye(1, model.nv, dof)[0], 1.0)
+                    else:
+                        self.qvel[dof] += side
+                    mujoco.mj_inverse(model, data)
+                    mujoco.mj_fwdActuation(model, data)
+                    ends.append(self._next())
+                    self.qpos[:], self.qvel[:] = kept
+                found[f"next {name}"][dof] = (ends[0] - ends[1]) / (2 * _WIDTH)
+
+
+def shapes(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
+    """Return the shapes of what `Inverse.blocks` writes."""
+    nv, na, nu = model.nv, model.na, model.nu
+    found = {"qpos": (nv, nv), "qvel": (nv, nv), "qacc": (nv, nv), "act": (na, nv), "ctrl": (nu, nv)}
+    return found | {f"next {name}": (found[name][0], na) for name in ("qpos", "qvel", "act", "ctrl")}
+
+
+def step_of(
+    layout: Layout, timestep: float, speeds: Float[np.ndarray, "rows nv"], found: dict[str, np.ndarray], names: list[str]
+) -> dict[str, np.ndarray]:
+    """Return the derivatives of steps by "state" and by what else is named, from those of R, inputs first.
+
+    Args:
+        layout: of the model.
+        timestep: h.
+        speeds: velocities after the steps.
+        found: "qpos", "qvel", "qacc" and "act" of R, and of each name, with "next" of activations where the model has any.
+        names: of other inputs and numbers.
+    """
+    nv, na = layout.nv, found["act"].shape[-2]
+    every = ["qpos", "qvel", "act", *names]
+    sizes = [found[name].shape[-2] for name in every]
+    right = np.swapaxes(np.concatenate([found[name] for name in every], axis=-2), -1, -2)
+    change = -timestep * np.linalg.solve(np.swapaxes(found["qacc"], -1, -2), right)
+    change[..., nv : 2 * nv] += np.eye(nv)
+    turned = timestep * speeds
+    moved = layout.follow(turned, timestep * change)
+    moved[..., :nv] += layout.carry(turned, np.broadcast_to(np.eye(nv), (*speeds.shape[:-1], nv, nv)))
+    ends = np.cumsum(sizes)
+    for name, begin, end in zip(every[4:], ends[3:-1], ends[4:], strict=True):
+        moved[..., begin:end] += layout.carry(turned, np.swapaxes(found[f"shift {name}"], -1, -2))
+    rows = [moved, change]
+    if na:
+        rows.append(np.swapaxes(np.concatenate([found[f"next {name}"] for name in every], axis=-2), -1, -2))
+    whole = np.concatenate(rows, axis=-2)
+    parts = np.split(whole, np.cumsum(sizes)[:-1], axis=-1)
+    return {"state": np.concatenate(parts[:3], axis=-1), **dict(zip(names, parts[3:], strict=True))}

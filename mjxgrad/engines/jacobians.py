@@ -1,0 +1,475 @@
+"""Derivatives of single steps of C MuJoCo, on one thread: from the solution where that has all, else from whole steps.
+
+For a slope they know of the events near a step, see `engines.events`.
+"""
+
+import copy
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjxgrad.engines import inverse
+from mjxgrad.engines.events import HAIR, Events, Near, Surfaces, clearance, undecided
+from mjxgrad.engines.flight import Begun
+from mjxgrad.engines.inverse import Inverse
+from mjxgrad.engines.layout import EVERY, INPUTS, Layout
+from mjxgrad.engines.stepmap import FIRST, PAIRS
+from mjxgrad.stepping import Gradient
+
+_WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's own documentation has it; of parameters as a share of their value
+_NARROW = 4e-9  # of those by inverse dynamics, with room
+# How the names of model arrays and inputs end that move surfaces.
+_SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
+_RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
+_NOTHING = 1e-9  # of a displacement by one
+# Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
+_STEEP, _NARROWER = 10.0, 1 / 30
+_TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
+_OF_TIME = "opt.timestep"
+
+_TOGETHER = 64  # rows whose algebra is done at once
+
+_Found = dict[str, np.ndarray]
+
+
+def solved(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy whose solves leave nothing to see."""
+    model = copy.deepcopy(model)
+    model.opt.tolerance, model.opt.iterations = _TOLERANCE, max(_ITERATIONS, model.opt.iterations)
+    if inverse.has_inverse(model):
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON  # the solution is one, whoever finds it
+    return model
+
+
+@dataclass
+class Steps:
+    """Steps to be differentiated, and what is found of them.
+
+    Attributes:
+        rows: whole states of MuJoCo before each.
+        models: of each, shared where they are the same.
+        speeds: of each model, velocities that its motions reach.
+        gradient: "discrete" or "slope".
+        found: arrays to be written, by name, with one entry per row.
+        begun: pairs that begin, by row.
+        chosen: other models than given, where rounding decides if a contact acts.
+        is_finite: whether a step ends in numbers.
+    """
+
+    rows: Float[np.ndarray, "rows size"]
+    models: list[mujoco.MjModel]
+    speeds: Mapping[int, Float[np.ndarray, "some nv"]]
+    gradient: Gradient
+    found: _Found
+    is_finite: Bool[np.ndarray, " rows"]
+    begun: dict[int, Begun] = field(default_factory=dict)
+    chosen: dict[int, mujoco.MjModel] = field(default_factory=dict)
+
+
+@dataclass
+class _Row:
+    """A step of which derivatives are taken: its state, its end and acceleration, and where they are taken.
+
+    Attributes:
+        before, after: whole states before and after the step.
+        found: what is to be written of it.
+        raw: derivatives of R, inputs first.
+        by: inverse dynamics, also of another model where rounding decides.
+        clear: the state about which no small difference crosses a surface.
+        near: surfaces near the state.
+        turned: the angles and lengths by which positions move in the step.
+        is_explicit: whether R has all that the step does.
+    """
+
+    before: Float[np.ndarray, " size"]
+    after: Float[np.ndarray, " size"]
+    found: _Found
+    raw: _Found
+    by: Inverse
+    clear: Float[np.ndarray, " size"]
+    acceleration: Float[np.ndarray, " nv"]
+    near: Near | None = None
+    begun: Begun | None = None
+    is_explicit: bool = False
+
+    @property
+    def events(self) -> Events | None:
+        return None if self.near is None else self.near.events
+
+
+class Worker:
+    """The derivatives of one thread, which keeps its memory and its copy of a model."""
+
+    def __init__(self, layout: Layout, levers: np.ndarray):
+        self.layout, self.levers, self.given = layout, levers, None
+
+    @np.errstate(invalid="ignore", over="ignore", divide="ignore")
+    def fill(self, steps: Steps, index: list[int]) -> None:
+        """Write the derivatives of chosen rows, those of one model together."""
+        for model, group in itertools.groupby(index, key=lambda i: id(steps.models[i])):
+            self._use(steps.models[(rows := list(group))[0]], steps.speeds[model], steps.gradient)
+            for begin in range(0, len(rows), _TOGETHER):
+                self._together(steps, rows[begin : begin + _TOGETHER])
+
+    def _use(self, given: mujoco.MjModel, speeds: np.ndarray, gradient: Gradient) -> None:
+        """Take a model for what follows, whose motions move so fast."""
+        if given is not self.given:
+            self.given, self.model, self.others = given, copy.deepcopy(given), None
+            self.inverse, self.is_explicit = Inverse(self.model, self.layout), inverse.has_inverse(self.model)
+        self.surfaces = Surfaces(self.model, self.levers, speeds if gradient == "slope" else 0 * speeds)
+        self.far = mujoco.MjData(self.surfaces.model)
+
+    def _together(self, steps: Steps, index: list[int]) -> None:
+        """Write the derivatives of rows of one model: differences one by one, the algebra at once."""
+        names = ["ctrl", *(name for name in steps.found if is_other(name))]
+        raw, done = self._memory(steps, names, len(index)), []
+        for k, i in enumerate(index):
+            one = self._begun(steps, i, {name: value[k] for name, value in raw.items()})
+            if one is not None:
+                steps.is_finite[i] = True
+                self._differentiate(one, names)
+                done.append((k, i, one))
+        explicit = [(k, one) for k, _, one in done if one.is_explicit]
+        self._assemble(raw, explicit, names)
+        for k, i, one in done:
+            if steps.gradient == "discrete" and one.is_explicit and self._steepness(one.found["state"]) > _STEEP / self.model.opt.timestep:
+                self._beside(steps, i, one, names)
+            self._with_events(one, names)
+            if one.begun is not None:
+                steps.begun[i] = one.begun
+            if one.by is not self.inverse:
+                steps.chosen[i] = one.by.model
+
+    def _memory(self, steps: Steps, names: list[str], count: int) -> _Found:
+        """Return room for the derivatives of R."""
+        shapes = inverse.shapes(self.model)
+        for name in names[1:]:
+            columns = steps.found[name].shape[-1]
+            shapes |= {name: (columns, self.layout.nv), f"shift {name}": (columns, self.layout.nv)}
+            shapes |= {f"next {name}": (columns, self.model.na)}
+        raw = {name: np.zeros((count, *shape)) for name, shape in shapes.items()}
+        raw["qacc"][:] = np.eye(self.layout.nv)
+        return raw
+
+    def _assemble(self, raw: _Found, rows: list[tuple[int, _Row]], names: list[str]) -> None:
+        """Write the derivatives of steps from those of R."""
+        if not rows:
+            return
+        chosen = [k for k, _ in rows]
+        speeds = np.array([one.after[self.layout.places["qvel"]] for _, one in rows])
+        own = {name: value[chosen] for name, value in raw.items()}
+        parts = inverse.step_of(self.layout, self.model.opt.timestep, speeds, own, names)
+        for k, (_, one) in enumerate(rows):
+            for name, value in parts.items():
+                if name in one.found:
+                    one.found[name][:] = value[k]
+
+    def _begun(self, steps: Steps, i: int, raw: _Found) -> _Row | None:
+        """Return a step with what is near it and what begins there, or None if it does not end in numbers."""
+        found, row = {name: value[i] for name, value in steps.found.items()}, steps.rows[i].copy()
+        if not np.isfinite(row).all() or not np.isfinite(after := self._step(self.inverse, row)).all():
+            return None
+        one = _Row(row, after, found, raw, self.inverse, row, self._acceleration(row, after))
+        row[self.layout.places["warmstart"]] = after[self.layout.places["warmstart"]]
+        if steps.gradient == "slope":
+            self._look(one)
+        elif not self.is_explicit:
+            self._aside(one)
+        return one
+
+    def _look(self, one: _Row) -> None:
+        """Find the events near a state, and the motions from either side of them."""
+        speed, places = self.layout.places["qvel"], self.layout.places
+        mujoco.mj_setState(self.surfaces.model, self.far, one.before, EVERY)
+        near = self.surfaces.near(self.far, one.before[speed], one.after[speed], self.inverse.data.qacc_smooth)
+        if near is None:
+            return
+        one.near = near
+        if near.is_undecided:
+            self._decide(one)
+        if (events := near.events) is None:
+            return
+        one.begun = self._pairs(one, events)
+        if not np.isfinite(one.begun.apart).all():  # a step from beside this state may end nowhere
+            one.near, one.begun = dataclasses.replace(near, events=None), None
+            return
+        small = _NARROW if self.is_explicit else _WIDTH
+        shift = clearance(small, events.surfaces, events.gaps, events.centres)
+        if shift.any():
+            self._move(one, shift)
+        if self.surfaces.lead:
+            for move, rates in zip(events.moves.T, events.rows, strict=True):
+                one.clear = self._off_stages(one, _WIDTH * np.abs(rates).max() * move)
+
+    def _aside(self, one: _Row) -> None:
+        """Take small differences about a state from which they cross no surface, and with gaps of rounding's size as they are."""
+        mujoco.mj_setState(self.surfaces.model, self.far, one.before, EVERY)
+        shift, is_undecided = self.surfaces.beside(_NARROW if self.is_explicit else _WIDTH, self.far)
+        if is_undecided:
+            self._decide(one)
+        if shift is not None:
+            self._move(one, shift)
+
+    def _beside(self, steps: Steps, i: int, one: _Row, names: list[str]) -> None:
+        """Differentiate a step anew whose differences are too steep to be of a contact."""
+        self._aside(one)
+        if one.clear is not one.before or one.by is not self.inverse:
+            raw = {name: value[None] for name, value in one.raw.items()}
+            for value in raw.values():
+                value[:] = 0.0
+            self._differentiate(one, names)
+            self._assemble(raw, [(0, one)] * one.is_explicit, names)
+
+    def _decide(self, one: _Row) -> None:
+        """Take the model in which gaps of the size of rounding are as they were in the step."""
+        if self.others is None:
+            self.others = [Inverse(model, self.layout) for model in undecided(self.model)]
+        speed = self.layout.places["qvel"]
+        one.by = min(self.others, key=lambda by: np.abs(self._step(by, one.before)[speed] - one.after[speed]).max())
+
+    def _move(self, one: _Row, shift: Float[np.ndarray, " nv"]) -> None:
+        """Take derivatives of a step from a little beside."""
+        one.clear = self.layout.moved(one.before, shift)
+        one.acceleration = self._acceleration(one.clear, self._step(one.by, one.clear))
+
+    def _acceleration(self, before: np.ndarray, after: np.ndarray) -> Float[np.ndarray, " nv"]:
+        speed = self.layout.places["qvel"]
+        return (after[speed] - before[speed]) / self.model.opt.timestep
+
+    def _pairs(self, one: _Row, events: Events) -> Begun:
+        """Return the two motions that span each event, after one step."""
+        layout, widths = self.layout, events.widths
+        sides = np.array([1.0, -1.0])
+        moves = events.middles.T[:, None] + (widths[:, None] * sides)[..., None] * events.moves.T[:, None]
+        starts = layout.moved(one.before, moves)
+        ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
+        felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, layout.num_rest)))
+        apart = layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]
+        begun = Begun(felt, ends[..., layout.motion], 2 * widths, apart)
+        begun.longest = 2 if self.surfaces.lead else begun.longest
+        return begun
+
+    def _differentiate(self, one: _Row, names: list[str]) -> None:
+        """Write small differences by all that is wanted: those of R, or where that lacks something those of whole steps."""
+        if self.is_explicit:
+            one.is_explicit = one.by.blocks(one.clear, one.acceleration, one.raw)
+        if not one.is_explicit:
+            self._by_steps(one)
+        self._by_others(one, names[1:])
+        if "C" in one.found:
+            self._sensors(one)
+
+    def _with_events(self, one: _Row, names: list[str]) -> None:
+        """Replace what small differences have along the displacements of events, and average the geometry of edges."""
+        events, matrix, nv = one.events, one.found["state"], self.layout.nv
+        if one.near is None:
+            return
+        rest = np.eye(nv)
+        if events is not None:
+            rest -= events.moves @ events.rows
+            lost = matrix[:, :nv] @ events.moves
+            matrix[:, nv : 2 * nv] -= lost @ events.ahead
+            one.begun.lost = lost
+        if one.near.is_rough:
+            by_rest = matrix[:, :nv] @ rest
+            self._visibly(one, rest, by_rest)
+            matrix[:, :nv] = by_rest
+        elif events is not None:
+            matrix[:, :nv] = matrix[:, :nv] @ rest
+        if events is not None and "apart" not in one.found:  # nobody follows them
+            matrix += one.begun.apart.T @ one.begun.felt
+
+    def _visibly(self, one: _Row, rest: Float[np.ndarray, "nv nv"], found: Float[np.ndarray, "size nv"]) -> None:
+        """Write derivatives along displacements by as much as moves surfaces visibly, where they move a rough contact."""
+        layout, near, places = self.layout, one.near, self.layout.places
+        sizes = np.abs(rest).max(axis=0)
+        found[:, sizes < _NOTHING] = 0.0  # what an event leaves of a coordinate that moves it alone
+        moving = np.flatnonzero((sizes >= _NOTHING) & (np.abs(rest[near.rough]).max(axis=0, initial=0.0) >= _NOTHING))
+        directions = rest[:, moving].T
+        if not len(moving):
+            return
+        widths = np.array([near.width(change) for change in directions])
+        changes = widths[:, None, None] * np.array([1.0, -1.0])[:, None] * directions[:, None]
+        starts = layout.moved(one.clear, changes)
+        if not one.is_explicit:
+            ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
+            found[:, moving] = (layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]).T
+            return
+        ends = one.by.solutions(one.clear, one.acceleration, one.raw["qacc"], starts[..., places["qpos"]].reshape(-1, self.model.nq))
+        ends = ends.reshape(len(moving), 2, layout.nv)
+        timestep = self.model.opt.timestep
+        change = timestep * ((ends[:, 0] - ends[:, 1]) / (2 * widths)[:, None]).T
+        turned = timestep * one.after[places["qvel"]]
+        found[: layout.nv, moving] = layout.carry(turned, directions.T) + layout.follow(turned, timestep * change)
+        found[layout.nv : 2 * layout.nv, moving] = change
+
+    def _by_steps(self, one: _Row) -> None:
+        """Write differences of whole steps; narrower ones, where these step over a jump."""
+        width = _WIDTH if one.near is None or not one.near.is_rough or self.surfaces.lead else _RUBBING
+        self._subtract(one, one.found, width)
+        if self._steepness(one.found["state"]) > _STEEP / self.model.opt.timestep:
+            narrow = {name: one.found[name].copy() for name in ("state", "ctrl") if name in one.found}
+            self._subtract(one, narrow, _NARROWER * width)
+            if self._steepness(narrow["state"]) < 0.5 * self._steepness(one.found["state"]):
+                for name, value in narrow.items():
+                    one.found[name][:] = value
+
+    def _subtract(self, one: _Row, found: _Found, width: float) -> None:
+        """Write differences of whole steps of this width by state and controls."""
+        layout = self.layout
+        changes = width * np.eye(layout.num_changes)
+        starts = np.stack([layout.moved(one.clear, side * changes) for side in (1, -1)], axis=1)
+        found["state"][:] = self._between(one, starts, np.full(len(starts), 2 * width)).T
+        if "ctrl" in found:
+            place = layout.places["ctrl"]
+            entries = np.arange(place.start, place.stop)
+            up, down, size = one.by.sides(one.clear[entries], width)
+            starts = np.tile(one.clear, (len(entries), 2, 1))
+            starts[np.arange(len(entries)), :, entries] = np.stack([up, down], axis=1)
+            found["ctrl"][:] = self._between(one, starts, size).T
+
+    def _between(self, one: _Row, starts: Float[np.ndarray, "columns 2 size"], widths: np.ndarray) -> np.ndarray:
+        """Return differences of the ends of steps over their widths, a row each."""
+        ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts]).reshape(starts.shape)
+        return self.layout.difference(ends[:, 0], ends[:, 1]) / widths[:, None]
+
+    def _off_stages(self, one: _Row, change: Float[np.ndarray, " nv"]) -> np.ndarray:
+        """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.
+
+        Accelerations move the stages, so that their places are not known beforehand.
+        """
+        row, layout = one.clear, self.layout
+        for _ in range(4):
+            sizes = np.array([1.0, 4.0])
+            starts = layout.moved(row, (sizes[:, None] * np.array([1.0, -1.0]))[..., None] * change)
+            near, far = self._between(one, starts, 2 * sizes)
+            if np.linalg.norm(near - far) <= 0.1 * np.linalg.norm(far):
+                break
+            row = layout.moved(row, 8 * change)
+        return row
+
+    def _steepness(self, matrix: Float[np.ndarray, "size size"]) -> float:
+        """Return the largest change of a velocity with a position, both of the farthest points that they move (1/s)."""
+        lengths = self.surfaces.lengths
+        nv = len(lengths)
+        return np.abs(matrix[nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(initial=0.0)
+
+    def _sensors(self, one: _Row) -> None:
+        """Write differences of sensors by state and controls."""
+        model, data, place = one.by.model, one.by.data, self.layout.places["ctrl"]
+        num = 2 * model.nv + model.na
+        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and num == self.layout.num_changes:
+            mujoco.mj_setState(model, data, one.clear, EVERY)
+            mujoco.mjd_transitionFD(model, data, _WIDTH, True, None, None, one.found["C"], one.found["D"])
+            return
+        starts = [self.layout.moved(one.clear, side * _WIDTH * np.eye(self.layout.num_changes)) for side in (1, -1)]
+        for name, (above, below) in (("C", starts), ("D", [one.clear + side * _WIDTH * np.eye(len(one.clear))[place] for side in (1, -1)])):
+            for column, pair in enumerate(zip(above, below, strict=True)):
+                ends = [(self._step(one.by, start), data.sensordata.copy())[1] for start in pair]
+                one.found[name][:, column] = (ends[0] - ends[1]) / (2 * _WIDTH)
+
+    def _by_others(self, one: _Row, names: list[str]) -> None:
+        """Write differences by inputs beside controls and by numbers of the model; what moves gaps has its share of events."""
+        for name in names:
+            events = one.events if moves_gaps(name) else None
+            shares = np.zeros((0 if events is None else len(events.widths), one.found[name].shape[1]))
+            for column, (put, size) in enumerate(self._changes(one, name)):
+                shift = np.zeros(self.layout.nv)
+                if events is not None:
+                    shares[:, column] = self._rates(put, size, events)
+                    shift = -events.moves @ shares[:, column]
+                starts = [self.layout.moved(put(side), side * shift) for side in (size, -size)]
+                if one.is_explicit and name != _OF_TIME:
+                    sides = [one.by.at(put_again, one.acceleration) for put_again in self._each(put, starts, size)]
+                    change = [(above - below) / (2 * size) for above, below in zip(*sides, strict=True)]
+                    one.raw[name][column], one.raw[f"next {name}"][column] = change
+                    one.raw[f"shift {name}"][column] = shift
+                else:
+                    ends = [self._step(one.by, start) for start in self._each(put, starts, size)]
+                    one.found[name][:, column] = self.layout.difference(*ends) / (2 * size)
+                put(0.0)
+            if one.begun is not None and events is not None:
+                one.begun.by_others[name] = shares
+
+    @staticmethod
+    def _each(put: Callable, starts: list[np.ndarray], size: float) -> Iterator[np.ndarray]:
+        """Give states while what is put is as it belongs to them."""
+        for start, side in zip(starts, (size, -size), strict=True):
+            put(side)
+            yield start
+
+    def _changes(self, one: _Row, name: str) -> Iterator[tuple[Callable[[float], np.ndarray], float]]:
+        """Give for each entry a function of an amount to the state that it changes so, and a small amount.
+
+        Numbers of the model change here and where gaps are measured.
+        """
+        if name in INPUTS:
+            place, size = self.layout.places[name], min(_WIDTH, HAIR) if moves_gaps(name) else _WIDTH
+            for entry in range(place.start, place.stop):
+                yield functools.partial(_with_entry, one.clear, entry), size
+            return
+        attribute, both = name.removeprefix("opt."), (one.by.model, self.surfaces.model)
+        holders = [model.opt for model in both] if name.startswith("opt.") else both
+        present = [np.array(getattr(holder, attribute, []), float).reshape(-1) for holder in holders]
+        for entry, values in enumerate(np.transpose(present).tolist()):
+            change = functools.partial(_with_number, one.clear, holders, attribute, entry, values)
+            yield change, 10 * _WIDTH * abs(values[0]) or _WIDTH
+
+    def _rates(self, put: Callable[[float], np.ndarray], size: float, events: Events) -> Float[np.ndarray, " modes"]:
+        """Return by how much the modes of events change with what is put."""
+        found = []
+        for amount in (0.0, size, -size):
+            mujoco.mj_setState(self.surfaces.model, self.far, put(amount), EVERY)
+            found.append((amount, *self.surfaces.gaps(self.far)))
+        alike = [(amount, gaps) for amount, owners, gaps in found if owners == found[0][1]]
+        (first, before), (last, after) = alike[-2:] if len(alike) > 1 else 2 * alike
+        change = (after - before) / (last - first if last != first else 1.0)
+        return events.weights @ change[events.index]
+
+    def _step(self, by: Inverse, row: np.ndarray) -> np.ndarray:
+        """Return the state after a step."""
+        mujoco.mj_setState(by.model, by.data, row, EVERY)
+        mujoco.mj_step(by.model, by.data)
+        mujoco.mj_getState(by.model, by.data, end := np.empty_like(row), EVERY)
+        return end
+
+
+def _with_entry(row: np.ndarray, entry: int, amount: float) -> np.ndarray:
+    """Return a state with an entry changed by an amount."""
+    row = row.copy()
+    row[entry] += amount
+    return row
+
+
+def _with_number(
+    row: np.ndarray, holders: Iterable, attribute: str, entry: int, values: list[float], amount: float
+) -> np.ndarray:
+    """Change a number of models to their values and an amount; the state is as it was."""
+    for holder, value in zip(holders, values, strict=True):
+        present = getattr(holder, attribute)
+        if isinstance(present, float):
+            setattr(holder, attribute, value + amount)
+        else:
+            present.reshape(-1)[entry] = value + amount
+    return row
+
+
+def with_pairs(wanted: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what is wanted with what tells of pairs: by the state, and what they feel of all that moves gaps."""
+    return (*wanted, *PAIRS, *FIRST, *(f"felt {name}" for name in wanted if moves_gaps(name)))
+
+
+def moves_gaps(name: str) -> bool:
+    """Return whether an array of the model or an input moves surfaces."""
+    return name.endswith(_SHAPES)
+
+
+def is_other(name: str) -> bool:
+    """Return whether a derivative is by an input beside controls or by numbers of the model."""
+    return " " not in name and name not in {"state", "ctrl", "C", "D", *PAIRS, *FIRST}

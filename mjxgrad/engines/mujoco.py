@@ -1,0 +1,347 @@
+"""C MuJoCo on all cores: batches of rollouts, and the derivatives of their steps."""
+
+import functools
+import math
+import os
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Float
+
+from mjxgrad._warnings import collected
+from mjxgrad.engines.events import levers_of
+from mjxgrad.engines.flight import NUM_SLOTS, Course, Flight, fly
+from mjxgrad.engines.jacobians import Steps, Worker, solved, with_pairs
+from mjxgrad.engines.layout import EVERY, MOTION, PHYSICS, USER, Layout
+from mjxgrad.engines.stepmap import FIRST, PAIRS, advance
+from mjxgrad.scene.scene import with_numbers
+from mjxgrad.stepping import Gradient
+
+START = ("time", *MOTION)
+ONCE = (*FIRST, "flight")
+"""What is found of a whole motion, not of each of its steps."""
+_NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_MOST_NUMBERS = 2e7  # of derivatives that are held at a time, where they are not asked for
+
+_Arrays = Mapping[str, np.ndarray]
+
+
+@functools.lru_cache(maxsize=8)
+def engine_of(mj_model: mujoco.MjModel) -> "Engine":
+    """Return the engine of a C model; threads and memory are kept, and programs that call it are compiled once."""
+    return Engine(mj_model)
+
+
+class Engine:
+    """A pool of threads for one C model. Arrays have the batch's axes in front, of length one where they are shared."""
+
+    def __init__(self, mj_model: mujoco.MjModel):
+        self.mj_model, self.lock = mj_model, threading.Lock()
+        self.pool, self.threads = mujoco.rollout.Rollout(nthread=_NUM_THREADS), ThreadPoolExecutor(_NUM_THREADS)
+        self.memory = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
+        self.start, self.layout = mujoco.MjData(mj_model), Layout(mj_model)
+        self.places = self.layout.places
+        self.plain = with_numbers(mj_model, {})
+        # A state that is not finite stays so, and is seen.
+        self.plain.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.kept = ({}, self.plain)  # the last numbers that all of a batch shared, and their model
+        self.exact = (self.plain, solved(self.plain))  # the last of these models, and as it is differentiated
+        levers = levers_of(mj_model)
+        self.lengths = levers.max(axis=0)
+        self.workers = [Worker(self.layout, levers) for _ in range(_NUM_THREADS)]
+        self.template = np.zeros(self.layout.size)
+        mujoco.mj_getState(mj_model, self.start, self.template, EVERY)
+        self.first = {name: self.template[self.places[name]] for name in MOTION}
+
+    def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
+        """Return positions, velocities, activations and what else goes on, after each step.
+
+        With a warm start, "warmstart" is that of the next step after a single one, so that steps one by one are the same motion to
+        the last bit; after several it is zero.
+        """
+        with self.lock, collected():
+            batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
+            rows = self._rows(start)
+            if "warmstart" in start and inputs["ctrl"].shape[1] == 1:
+                found = self._run_once(models, rows, inputs)
+            else:
+                found = self._run(models, rows, inputs)
+                found |= {"warmstart": np.zeros_like(start["warmstart"])} if "warmstart" in start else {}
+        return {name: part.reshape(*batch, *part.shape[1:]) for name, part in found.items()}
+
+    def _run_once(self, models: list[mujoco.MjModel], rows: np.ndarray, inputs: _Arrays) -> dict[str, np.ndarray]:
+        """Return the same of single steps, with warm starts, which the pool of rollouts does not give."""
+        for name, value in inputs.items():
+            rows[:, self.places[name]] = value.reshape(len(rows), -1)
+
+        def work(data: mujoco.MjData, piece: list[int]) -> None:
+            for i in piece:
+                mujoco.mj_setState(models[i], data, rows[i], EVERY)
+                mujoco.mj_step(models[i], data)
+                mujoco.mj_getState(models[i], data, rows[i], EVERY)
+
+        self._share(work, self.memory, len(rows))
+        return {name: rows[:, None, self.places[name]] for name in MOTION} | {"warmstart": rows[:, self.places["warmstart"]]}
+
+    def _run(self, models: list[mujoco.MjModel], rows: np.ndarray, inputs: _Arrays) -> dict[str, np.ndarray]:
+        """Return the same of many steps, by the pool of rollouts."""
+        user = rows[:, self.places["ctrl"].start : self.places["mocap_quat"].stop]
+        given = np.repeat(user[:, None], inputs["ctrl"].shape[1], axis=1)
+        for name, value in inputs.items():
+            place = self.places[name].start - self.places["ctrl"].start
+            width = math.prod(value.shape[2:])
+            given[..., place : place + width] = value.reshape(*value.shape[:2], width)
+        warm = rows[:, self.places["warmstart"]]
+        return self._motions(self._together(rows, models, given, initial_warmstart=warm))
+
+    def _together(self, rows: np.ndarray, models: list[mujoco.MjModel], given: np.ndarray, **how: np.ndarray) -> np.ndarray:
+        """Return physical states after each step of several motions at once."""
+        full = np.zeros((len(rows), mujoco.mj_stateSize(self.mj_model, PHYSICS)))
+        for row, part in zip(rows, full, strict=True):
+            mujoco.mj_extractState(self.mj_model, row, EVERY, part, PHYSICS)
+        return np.asarray(self.pool.rollout(models, self.memory, full, given, control_spec=USER, **how)[0])
+
+    def _motions(self, found: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the parts of physical states, of which plugins come last."""
+        parts = {name: found[..., self.places[name]] for name in MOTION[:-1]}
+        return parts | {"plugin": found[..., found.shape[-1] - self.layout.sizes["plugin"] :]}
+
+    def _steps(self, rows: Float[np.ndarray, "rows size"], models: list[mujoco.MjModel]) -> np.ndarray:
+        """Return the motions after single steps of many states."""
+        user = rows[:, None, self.places["ctrl"].start : self.places["mocap_quat"].stop]
+        warm = rows[:, self.places["warmstart"]]
+        parts = self._motions(self._together(rows, models, user, initial_warmstart=warm)[:, 0])
+        return np.concatenate([parts[name] for name in MOTION], axis=-1)
+
+    def steer(
+        self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
+    ) -> dict[str, np.ndarray]:
+        """Return states and controls under a law: controls that a gain corrects by the distance from nominal states, in limits.
+
+        A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
+        """
+        with self.lock, collected():
+            batch, models, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
+            nq, nv, bits = self.mj_model.nq, self.mj_model.nv, mujoco.mjtState
+            motion = bits.mjSTATE_QPOS.value | bits.mjSTATE_QVEL.value | bits.mjSTATE_ACT.value
+            found = {"states": np.zeros(law["states"].shape), "controls": np.zeros(law["controls"].shape, dtype)}
+            columns = (*(law[name] for name in ("states", "controls", "gain")), *found.values())
+            rows = self._rows(start)
+
+            @np.errstate(invalid="ignore", over="ignore")
+            def work(data: mujoco.MjData, piece: list[int]) -> None:
+                away, ctrl = np.zeros(law["gain"].shape[3]), data.ctrl
+                for i in piece:
+                    state = law["states"][i, 0]
+                    follows, lower, upper = (law[name][i] for name in ("follows", "lower", "upper"))
+                    mujoco.mj_setState(models[i], data, rows[i], EVERY)
+                    mujoco.mj_setState(models[i], data, state, motion)
+                    for nominal, control, gain, end, chosen in zip(*(x[i] for x in columns), strict=True):
+                        if follows:
+                            mujoco.mj_differentiatePos(models[i], away[:nv], 1.0, nominal[:nq], state[:nq])
+                            np.subtract(state[nq:], nominal[nq:], out=away[nv:])
+                            control = control + gain @ away
+                        np.minimum(np.maximum(control, lower), upper, out=chosen)
+                        ctrl[:] = chosen
+                        mujoco.mj_step(models[i], data, num_substeps)
+                        mujoco.mj_getState(models[i], data, end, motion)
+                        state = end
+
+            self._share(work, self.memory, len(models))
+        return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
+
+    def maps(
+        self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
+        gradient: Gradient, wanted: tuple[str, ...],
+    ) -> dict[str, np.ndarray]:  # fmt: skip
+        """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted.
+
+        Those of the sensors, "C" and "D", are of small differences with either gradient.
+
+        Args:
+            numbers: of the model, that differ from the file's.
+            before: states before each step, with an axis of steps as inputs have it.
+            inputs: of each step.
+            flight: pairs in flight before the first step, packed; see `engines.flight`.
+            gradient: "discrete" or "slope".
+            wanted: names; with those of `stepmap.PAIRS` pairs of motions are followed from step to step, and "flight" has them
+                after the last.
+        """
+        with self.lock, collected():
+            given = {**before, "flight": flight}
+            batch, models, given, inputs = self._flat(np.ndim(before["time"]) - 2, numbers, given, inputs)
+            flight = given.pop("flight")
+            sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
+            sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
+            found = self._maps(models, given, inputs, flight, gradient, wanted, sizes)
+        return {name: found[name].reshape(*batch, *found[name].shape[1:]) for name in ("state", *wanted)}
+
+    def _maps(
+        self, models: list, before: _Arrays, inputs: _Arrays, flight: np.ndarray, gradient: Gradient,
+        wanted: tuple[str, ...], sizes: Mapping[str, int],
+    ) -> dict[str, np.ndarray]:  # fmt: skip
+        num, steps = inputs["ctrl"].shape[:2]
+        rows = self._rows({k: v.reshape(num * steps, *v.shape[2:]) for k, v in {**before, **inputs}.items()})
+        exact = {id(model): self._exact(model) for model in models}
+        every = [exact[id(model)] for model in models for _ in range(steps)]
+        shapes = self.shapes(wanted, sizes)
+        found = {name: np.zeros((num, steps, *shape)) for name, shape in shapes.items() if name not in ONCE}
+        flat = {name: value.reshape(num * steps, *value.shape[2:]) for name, value in found.items()}
+        speeds: dict[int, list] = {}
+        for one, course in zip(every[::steps], before["qvel"], strict=True):
+            speeds.setdefault(id(one), []).append(course)
+        reached = {key: (one := np.concatenate(courses))[np.isfinite(one).all(axis=1)] for key, courses in speeds.items()}
+        work = Steps(rows, every, reached, gradient, flat, np.zeros(len(rows), bool))
+        self._share(lambda worker, piece: worker.fill(work, piece), self.workers, len(rows))
+        if "apart" in wanted:
+            found |= {name: np.zeros((num, *shapes[name])) for name in FIRST}
+            place = lambda motion, t: motion * steps + t  # noqa: E731
+            course = Course(
+                rows.reshape(num, steps, -1),
+                found["state"],
+                {divmod(i, steps): one for i, one in work.begun.items()},
+                lambda motion, t: work.chosen.get(place(motion, t), every[place(motion, t)]),
+                work.is_finite.reshape(num, steps),
+            )
+            pairs = Flight.unpacked(flight, self.layout, course.rows[:, 0])
+            fly(pairs, course, self.layout, self.lengths, self.mj_model.opt.timestep, self._steps, found)
+            if "flight" in wanted:
+                ends = course.rows[:, -1].copy()
+                if (chosen := np.flatnonzero((pairs.widths > 0).any(axis=1))).size:
+                    ends[np.ix_(chosen, self.layout.motion)] = self._steps(ends[chosen], [models[k] for k in chosen])
+                found["flight"] = pairs.packed(self.layout, ends)
+        return found
+
+    def product(
+        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]
+    ) -> dict[str, np.ndarray]:
+        """Return the derivative of the end of a motion by its start and inputs held all the time, and "end", the state there."""
+        steps = np.shape(inputs["ctrl"])[-2]
+        after = self.run(numbers, start, inputs)
+        before = self._before(start, after)
+        names = with_pairs(wanted) if gradient == "slope" and steps > 1 else wanted
+        flight = self.no_flight(np.shape(start["time"])[:-1])
+        found = self.maps(numbers, before, inputs, flight, gradient=gradient, wanted=names)
+        batch = found["state"].shape[:-3]
+        found = {name: value.reshape(-1, *value.shape[len(batch) :]) for name, value in found.items()}
+        sizes = {name: found[name].shape[-1] for name in ("state", *wanted)}
+        size, width = self.layout.num_changes, sum(sizes.values())
+        ends = []
+        for k in range(len(found["state"])):
+            one = {name: value[k] for name, value in found.items()}
+
+            def added(t: int, kind: str, rows: int, one: dict = one) -> np.ndarray:
+                parts = [one[f"{kind}{k}"][t] if f"{kind}{k}" in one else np.zeros((rows, sizes[k])) for k in wanted]
+                return np.concatenate([np.zeros((rows, size)), *parts], axis=-1)
+
+            each = [
+                {name: one[name][t] for name in ("state", *PAIRS) if name in one}
+                | {"by state": added(t, "", size), "by felt": added(t, "felt ", one["felt"].shape[1]) if "felt" in one else 0.0}
+                for t in range(steps)
+            ]
+            main, held, total = np.eye(size, width), np.zeros((NUM_SLOTS, width)), None
+            for step in each:
+                main, held, total = advance(np, main, held, step)
+            ends.append(total)
+        parts = np.split(np.reshape(ends, (*batch, size, width)), np.cumsum(list(sizes.values()))[:-1], axis=-1)
+        end = np.concatenate([after[name][..., -1, :] for name in MOTION], axis=-1)
+        is_good = np.isfinite(end).all(axis=-1, keepdims=True)
+        return dict(zip(sizes, parts, strict=True)) | {"end": np.where(is_good, end, np.nan)}
+
+    def follow(
+        self, gradient: Gradient, numbers: _Arrays, start: _Arrays, inputs: _Arrays, changes: tuple[np.ndarray, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Return a motion as `run` does and, as "change", what becomes of a change of the start and of the controls."""
+        after = self.run(numbers, start, inputs)
+        num, steps = after["qvel"].shape[:2]
+        size, before = self.layout.num_changes, self._before(start, after)
+        after["change"] = np.zeros((num, steps, size))
+        wanted = ("ctrl",) if changes[1].any() else ()
+        names = with_pairs(wanted) if gradient == "slope" else wanted
+        together = max(1, int(_MOST_NUMBERS / (steps * size * (2 * size + NUM_SLOTS))))
+        for first in range(0, num, together):
+            part = slice(first, first + together)
+            cut = lambda arrays: {k: v[part] if len(v) == num else v for k, v in arrays.items()}  # noqa: E731
+            flight = self.no_flight((len(range(num)[part]),))
+            found = self.maps(cut(numbers), cut(before), cut(inputs), flight, gradient=gradient, wanted=names)
+            for k, motion in enumerate(range(num)[part]):
+                main, held = changes[0][motion], np.zeros(NUM_SLOTS)
+                for t, push in enumerate(changes[1][motion]):
+                    one = {name: found[name][k, t] for name in ("state", *PAIRS) if name in found}
+                    one |= {"by state": found["ctrl"][k, t] @ push if wanted else 0.0, "by felt": 0.0}
+                    main, held, after["change"][motion, t] = advance(np, main, held, one)
+        return after
+
+    def no_flight(self, batch: tuple[int, ...]) -> np.ndarray:
+        """Return the room of motions without pairs in flight."""
+        return np.zeros((*batch, *self.flight_shape))
+
+    @property
+    def flight_shape(self) -> tuple[int, int]:
+        """Slots, and numbers of a pair."""
+        return NUM_SLOTS, 2 * self.layout.num_changes + 3
+
+    def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the derivatives of one step: of its end by all that is wanted, and of its sensors, "C" and "D".
+
+        Of a whole motion are those of `ONCE`.
+        """
+        model, size = self.mj_model, self.layout.num_changes
+        own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu)}
+        own |= {"felt": (model.nv, size), "slot": (model.nv,), "apart": (size, NUM_SLOTS), "stays": (NUM_SLOTS,)}
+        own |= {"before": (size, NUM_SLOTS), "enters": (NUM_SLOTS,), "flight": self.flight_shape}
+        own |= {k: (model.nv if k.startswith("felt") else size, sizes[k.split()[-1]]) for k in wanted if k not in own}
+        return {"state": (size, size)} | {k: own[k] for k in wanted}
+
+    def _before(self, start: _Arrays, after: _Arrays) -> dict[str, np.ndarray]:
+        """Return states before each step."""
+        found = {}
+        for name in MOTION:
+            first = np.asarray(start[name], float)[..., None, :] if name in start else self.template[self.places[name]]
+            first = np.broadcast_to(first, (*after[name].shape[:-2], 1, after[name].shape[-1]))
+            found[name] = np.concatenate([first, after[name][..., :-1, :]], axis=-2)
+        steps = after["qpos"].shape[-2]
+        found["time"] = np.asarray(start["time"], float)[..., None, :] + self.mj_model.opt.timestep * np.arange(steps)[:, None]
+        return found
+
+    def _exact(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        """Return a model as it is differentiated; the last is kept."""
+        if model is not self.exact[0]:
+            self.exact = (model, solved(model))
+        return self.exact[1]
+
+    def _share(self, work: Callable, workers: list, count: int) -> None:
+        """Do so many things on all threads; each takes its piece of them."""
+        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(_NUM_THREADS, count))]
+        list(map(work, workers, pieces) if len(pieces) == 1 else self.threads.map(work, workers, pieces))
+
+    def _flat(self, ndim: int, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> tuple:
+        """Return the batch's shape, one model for each of it or for all, and the arrays with one axis for the batch's."""
+        values = {name: np.asarray(value) for name, value in numbers.items()}
+        given = [{k: np.asarray(v, float) for k, v in one.items()} for one in (start, inputs)]
+        batch = np.broadcast_shapes(*(x.shape[:ndim] for one in (*given, values) for x in one.values()))
+
+        def flat(x: np.ndarray) -> np.ndarray:
+            return np.broadcast_to(x, batch + x.shape[ndim:]).reshape(math.prod(batch), *x.shape[ndim:])
+
+        varied = {name: flat(x) for name, x in values.items() if math.prod(x.shape[:ndim]) > 1}
+        shared = {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied}
+        content = {k: x.tobytes() for k, x in shared.items()}
+        if content != self.kept[0]:
+            self.kept = (content, with_numbers(self.plain, shared))
+        base = self.kept[1]
+        models = [base] * math.prod(batch)
+        if varied:
+            models = [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(len(models))]
+        return batch, models, *({k: flat(v) for k, v in one.items()} for one in given)
+
+    def _rows(self, start: _Arrays) -> Float[np.ndarray, "rows size"]:
+        """Return whole states of MuJoCo, one a row, of which the start is given."""
+        rows = np.tile(self.template, (len(start["time"]), 1))
+        for name, value in start.items():
+            rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
+        return rows

@@ -1,0 +1,166 @@
+"""Rollouts of C MuJoCo under `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`.
+
+The motion is one call; the derivatives of all its steps are another, once the motion is known, and the recursion of
+`engines.stepmap` takes a change of the start to the end. JAX transposes that recursion, so forward and reverse mode are one formula.
+
+Pairs of motions that are in flight at the end (see `engines.flight`) are part of the state, so that a rollout that goes on from
+there, one step of a policy or of an environment, has the derivative of one that was never interrupted. They are only there
+while JAX differentiates: elsewhere nobody asks for them.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.engines.flight import NUM_SLOTS
+from mjxgrad.engines.jacobians import with_pairs
+from mjxgrad.engines.layout import MOTION
+from mjxgrad.engines.mujoco import ONCE, Engine, engine_of
+from mjxgrad.engines.stepmap import PAIRS, advance, begin
+from mjxgrad.scene import Scene
+from mjxgrad.scene.scene import changed_numbers
+from mjxgrad.stepping import Gradient
+
+_Arrays = Mapping[str, Array]
+
+
+def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
+    """Return the parts of `layout.MOTION` after each step, as MuJoCo gives them; differentiable once, by all arguments.
+
+    Args:
+        scene: its model's numbers are arguments of the call, so that they may be traced, mapped over and differentiated by.
+        start: `time` of shape (1,) and the parts of the motion; "warmstart", "flight" and "held" as in `State`.
+        inputs: arrays with one row per step, under names of `INPUTS`; `ctrl` at least.
+        gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `engines.events`.
+
+    Returns:
+        Each with one row per step; "warmstart", "flight" and "held" after the last.
+    """
+    engine, dtype = engine_of(scene.mj_model), start["qpos"].dtype
+    horizon = len(inputs["ctrl"])
+    shapes = {k: jax.ShapeDtypeStruct((horizon, *start[k].shape), dtype) for k in MOTION}
+    shapes["warmstart"] = jax.ShapeDtypeStruct(start["qvel"].shape, dtype)
+    nothing = lambda: {"flight": jnp.zeros(engine.flight_shape, dtype), "held": jnp.zeros(NUM_SLOTS, dtype)}  # noqa: E731
+
+    @jax.custom_jvp
+    def call(numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, Array]:
+        motion = {name: start[name] for name in ("time", *MOTION, "warmstart")}
+        return _callback(engine.run, shapes, numbers, motion, inputs) | nothing()
+
+    @functools.partial(call.defjvp, symbolic_zeros=True)
+    def _derivative(primals, tangents) -> tuple[dict[str, Array], dict[str, Array]]:
+        numbers, start, inputs = primals
+        found = call(*primals)
+        by_number, by_start, by_input = tangents
+        given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
+        before = {k: jnp.concatenate([start[k][None], found[k][:-1]]) for k in MOTION}
+        before["time"] = (
+            start["time"]
+            + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
+        )
+        wanted = with_pairs(tuple(given)) + ("flight",) if gradient == "slope" else tuple(given)
+        maps = _maps(engine, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
+        forced = {part: jnp.zeros(maps[part].shape[:2], dtype) for part in ("state", "felt") if part in maps}
+        for part, name in itertools.product(forced, given):
+            own = name if part == "state" else f"{part} {name}"
+            if own in maps:
+                change = given[name].reshape((horizon, -1) if name in by_input else -1).astype(dtype)
+                forced[part] += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", maps[own], change)
+        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
+        changes = {k: zero(by_start[k]) for k in (*MOTION, "held")}
+        to_tangent = functools.partial(position_change, scene.model, start["qpos"])
+        moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
+        first = jnp.concatenate([moved, *(changes[name] for name in MOTION[1:])])
+        steps = {name: maps[name] for name in ("state", *PAIRS) if name in maps}
+        steps |= {f"by {name}": x for name, x in forced.items()}
+
+        def through(carry: tuple[Array, Array], step: dict[str, Array]) -> tuple[tuple[Array, Array], Array]:
+            main, held, total = advance(jnp, *carry, step)
+            return (main, held), total
+
+        carry = begin(first, changes["held"], maps) if "before" in maps else (first, changes["held"])
+        with jax.default_matmul_precision("highest"):
+            (_, held), course = jax.lax.scan(through, carry, steps)
+        sizes = [scene.model.nv, *(start[name].size for name in MOTION[1:])]
+        parts = jnp.split(course, np.cumsum(sizes)[:-1].tolist(), axis=1)
+        parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])
+        own = nothing() if gradient == "discrete" else {"flight": maps["flight"], "held": jnp.zeros_like(held)}
+        change = {"flight": jnp.zeros_like(own["flight"]), "held": jnp.zeros_like(held) if gradient == "discrete" else held}
+        change["warmstart"] = jnp.zeros_like(start["qvel"])
+        return found | own, dict(zip(MOTION, parts, strict=True)) | change
+
+    given = nothing() | {"warmstart": jnp.zeros_like(start["qvel"])} | dict(start)
+    given |= {name: jax.lax.stop_gradient(given[name]) for name in ("flight", "warmstart")}
+    return call(changed_numbers(scene), given, dict(inputs))
+
+
+def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tuple[Array, Array]:
+    """Return states and controls of a feedback law in one call, see `Engine.steer`."""
+    engine, first = engine_of(scene.mj_model), law["states"][0]
+    shapes = {name: jax.ShapeDtypeStruct(law[name].shape, first.dtype) for name in ("states", "controls")}
+    function = functools.partial(engine.steer, num_substeps, first.dtype)
+    found = _callback(function, shapes, changed_numbers(scene), start, law)
+    return jnp.concatenate([first[None], found["states"]]), found["controls"]
+
+
+def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]) -> dict[str, Array]:
+    """Return the derivative of several steps by "state" and inputs that are held, and "end", the state after them."""
+    engine = engine_of(scene.mj_model)
+    sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()}
+    shapes = engine.shapes(wanted, sizes) | {"end": (sum(start[name].size for name in MOTION),)}
+    function = functools.partial(engine.product, gradient=gradient, wanted=wanted)
+    return _once(function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
+
+
+def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]) -> dict[str, Array]:
+    """Return the derivatives of one step by "state" and all that is wanted, see `Engine.maps`."""
+    engine, before = engine_of(scene.mj_model), {name: x[None] for name, x in start.items()}
+    flight = jnp.zeros(engine.flight_shape, start["qpos"].dtype)
+    found = _maps(engine, changed_numbers(scene), before, inputs, flight, gradient=gradient, wanted=wanted)
+    return {name: value[0] for name, value in found.items()}
+
+
+def _maps(engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any) -> dict[str, Array]:
+    """Return what `Engine.maps` gives of states before each step."""
+    horizon = len(inputs["ctrl"])
+    sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
+    shapes = {k: v if k in ONCE else (horizon, *v) for k, v in engine.shapes(how["wanted"], sizes).items()}
+    return _once(functools.partial(engine.maps, **how), shapes, before["qpos"].dtype, numbers, before, inputs, flight)
+
+
+def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *arguments) -> dict[str, Array]:
+    """Call C MuJoCo for derivatives; they have none of their own."""
+    wanted = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
+
+    @jax.custom_jvp
+    def call(*arguments):
+        return _callback(function, wanted, *arguments)
+
+    @call.defjvp
+    def _refuse(primals, tangents):
+        raise ValueError('C MuJoCo has first derivatives alone: for second ones take engine "mjx"')
+
+    return call(*arguments)
+
+
+def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
+    def run(*given) -> dict[str, np.ndarray]:
+        given = jax.tree.map(np.asarray, given)
+        return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
+
+    return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
+
+
+def to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+    """Return a change in tangent space as one of coordinates."""
+    rest = jnp.zeros_like(change)
+    return jax.jvp(lambda velocity: integrate_position(scene.model, qpos, velocity, 1.0), (rest,), (change,))[1]
