@@ -83,7 +83,7 @@ def start_of(model: mujoco.MjModel, dtype: Any = float) -> _Start:
 
 def least_gap(model: mujoco.MjModel, qpos: np.ndarray) -> float:
     """Return how near a contact or limit is to its surface (m or rad), at most 1."""
-    surfaces = Surfaces(model, levers_of(model), np.zeros((1, model.nv)))
+    surfaces = Surfaces(model, levers_of(model))
     (far := mujoco.MjData(surfaces.model)).qpos[:] = qpos
     return np.abs(surfaces.gaps(far)[1]).min(initial=1.0).item()
 

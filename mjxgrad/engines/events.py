@@ -146,21 +146,23 @@ class Near:
 class Surfaces:
     """The gaps of a model's contacts and limits, also of those that do not act yet."""
 
-    def __init__(
-        self, model: mujoco.MjModel, levers: Float[np.ndarray, "nbody nv"], speeds: Float[np.ndarray, "states nv"]
-    ):
-        """Widen all margins by what states of these speeds travel in half a step, at most."""
-        self.lengths, self.timestep, self.is_moved = levers.max(axis=0), model.opt.timestep, levers > 0
+    def __init__(self, model: mujoco.MjModel, levers: Float[np.ndarray, "nbody nv"]):
+        self.levers, self.lengths = levers, levers.max(axis=0)
+        self.timestep, self.is_moved = model.opt.timestep, levers > 0
         self.longest = max(1.0, self.lengths.max(initial=0.0))
         self.kept = kept_by_damping(model)
         # How far ahead of the start of a step its stages lie, in the mean (s).
         self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
-        self.levers = levers
-        self.contact_reach, self.limit_reach = self._reach(np.max(np.abs(speeds), axis=0, initial=0.0))
         # The last entry is for -1, the vertices of flexible bodies.
         self.is_rough = np.append(~np.isin(model.geom_type, _SMOOTH), False)
-        self.model = widened(model, self.contact_reach, self.limit_reach)
+        self.plain, self.model = model, copy.deepcopy(model)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        self.widen(np.zeros((1, model.nv)))
+
+    def widen(self, speeds: Float[np.ndarray, "states nv"]) -> None:
+        """Widen all margins by what states of these speeds travel in half a step, at most."""
+        self.contact_reach, self.limit_reach = self._reach(np.max(np.abs(speeds), axis=0, initial=0.0))
+        _widen(self.model, self.plain, self.contact_reach, self.limit_reach)
 
     def _reach(self, speed: Float[np.ndarray, " nv"]) -> tuple[float, float]:
         """Return how far contacts and limits travel in half a step at most."""
@@ -280,14 +282,17 @@ def kept_by_damping(model: mujoco.MjModel) -> Float[np.ndarray, " nv"]:
 
 def widened(model: mujoco.MjModel, contact: float, limit: float) -> mujoco.MjModel:
     """Return a copy whose contacts and limits act at gaps larger by so much (m; m or rad)."""
-    far = copy.deepcopy(model)
-    far.geom_margin[:] += contact / 2
-    far.flex_margin[:] += contact / 2
-    far.pair_margin[:] += contact
-    far.opt.o_margin += contact
-    far.jnt_margin[:] += limit
-    far.tendon_margin[:] += limit
+    _widen(far := copy.deepcopy(model), model, contact, limit)
     return far
+
+
+def _widen(far: mujoco.MjModel, model: mujoco.MjModel, contact: float, limit: float) -> None:
+    far.geom_margin[:] = model.geom_margin + contact / 2
+    far.flex_margin[:] = model.flex_margin + contact / 2
+    far.pair_margin[:] = model.pair_margin + contact
+    far.opt.o_margin = model.opt.o_margin + contact
+    far.jnt_margin[:] = model.jnt_margin + limit
+    far.tendon_margin[:] = model.tendon_margin + limit
 
 
 def undecided(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjModel]:

@@ -105,7 +105,7 @@ class Course:
     """Steps of a batch of motions: their states, what their events begin, and derivatives without events."""
 
     rows: Float[np.ndarray, "motions steps size"]
-    matrices: Float[np.ndarray, "motions steps size size"]
+    matrices: Float[np.ndarray, "motions steps changes changes"]
     begun: Mapping[tuple[int, int], Begun]
     models: Callable[[int, int], mujoco.MjModel]
     is_finite: Bool[np.ndarray, "motions steps"]

@@ -36,7 +36,8 @@ _PUSH = 1e-5  # m/s² or rad/s², by which R is nearly linear: forces have kinks
 _RESIDUAL = 1e-6  # of the largest force, above which a step has no R that is zero
 _TINY = 1e-30
 _VELOCITY = mujoco.mjtStage.mjSTAGE_POS.value  # the stage that is done: velocities are next
-_ROUND = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX)
+# Shapes whose contacts with all but planes are found by iterations.
+_ITERATED = tuple(getattr(mujoco.mjtGeom, f"mjGEOM_{name}").value for name in ("HFIELD", "ELLIPSOID", "CYLINDER", "MESH", "SDF"))
 _OWN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
 # Those whose matrix has the derivatives of forces by velocity; the last is known to later releases alone.
 _IMPLICIT = tuple(
@@ -71,13 +72,21 @@ class Inverse:
             or model.tendon_actfrclimited.any()
             or (model.opt.integrator in _IMPLICIT and depends.any())
         )
-        self.is_coupled, self.is_iterative = is_coupled, not np.isin(model.geom_type, _ROUND).all()
+        self.is_coupled, self.is_pulled = is_coupled, False
+        # The last entry is for -1, the vertices of flexible bodies.
+        self.is_iterated = np.append(np.isin(model.geom_type, _ITERATED), True)
+        self.has_iterated = bool(self.is_iterated[:-1].any()) or model.nflex > 0
+        self.is_plane = np.append(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, False)
         of_act = np.zeros(model.na, int)
         order = np.zeros(model.na, int)
         for actuator, (first, count) in enumerate(zip(model.actuator_actadr, model.actuator_actnum, strict=True)):
             if count > 0:
                 of_act[first : first + count], order[first : first + count] = actuator, np.arange(count)
         self.of_act, self.order = of_act, order
+
+    def _set(self, row: np.ndarray) -> None:
+        mujoco.mj_setState(self.model, self.data, row, EVERY)
+        self.is_pulled = bool(row[self.layout.places["xfrc_applied"]].any())
 
     def residual(self, skip: int = 0) -> Float[np.ndarray, " nv"]:
         """Return inverse dynamics less actuators of what is in `data`; stages before may be skipped."""
@@ -92,7 +101,7 @@ class Inverse:
     def applied(self) -> Float[np.ndarray, " nv"]:
         """Return applied forces at the position in `data`."""
         data, found = self.data, self.data.qfrc_applied.copy()
-        for body in np.flatnonzero(data.xfrc_applied.any(axis=1)).tolist():
+        for body in np.flatnonzero(data.xfrc_applied.any(axis=1)).tolist() if self.is_pulled else ():
             force, torque = np.split(data.xfrc_applied[body], 2)
             mujoco.mj_applyFT(self.model, data, force, torque, data.xipos[body], body, found)
         return found
@@ -106,7 +115,7 @@ class Inverse:
             found: "qpos", "qvel", "qacc" of R; "act" and "ctrl", where there are such, of R and, as "next ...", of activations.
         """
         model, data = self.model, self.data
-        mujoco.mj_setState(model, data, row, EVERY)
+        self._set(row)
         self.qacc[:] = acceleration
         nothing = [None] * 6
         self._by_position(found["qpos"])
@@ -122,20 +131,25 @@ class Inverse:
         if model.nu or model.na:
             (self._one_by_one if self.is_coupled else self._all_at_once)(found)
             mujoco.mj_setState(model, data, row, EVERY)
-        if data.xfrc_applied.any():
+        if self.is_pulled:
             self._by_applied(found["qpos"])
-        size = max(np.abs(data.qfrc_bias).max(), np.abs(data.qfrc_constraint).max(), np.abs(data.qfrc_inverse).max(), 1e-9)
-        return bool(np.abs(at - self.applied()).max() <= _RESIDUAL * size)
+        # Of the largest force, by squares: this is asked at every step.
+        off, forces = at - self.applied(), (data.qfrc_bias, data.qfrc_constraint, data.qfrc_inverse)
+        return bool(off @ off <= _RESIDUAL**2 * max(sum(one @ one for one in forces), _TINY))
 
     def _by_position(self, found: np.ndarray) -> None:
         model, data = self.model, self.data
-        if not self.is_iterative:
+        if not (data.ncon and self._is_iterative(np.asarray(data.contact.geom).reshape(-1, 2))):
             mujoco.mjd_inverseFD(model, data, _NARROW if data.nefc else _FREE, True, found, *[None] * 6)
             return
         mujoco.mjd_inverseFD(model, data, _WIDTH, True, found, *[None] * 6)
         mujoco.mjd_inverseFD(model, data, -_WIDTH, True, other := np.empty_like(found), *[None] * 6)
         found += other
         found *= 0.5
+
+    def _is_iterative(self, geoms: np.ndarray) -> bool:
+        """Return whether some pair of geoms has a contact that is found by iterations."""
+        return self.has_iterated and bool((self.is_iterated[geoms].any(axis=1) & ~self.is_plane[geoms].any(axis=1)).any())
 
     def _by_applied(self, found: np.ndarray) -> None:
         """Take what positions change of forces that are applied to bodies."""
@@ -170,7 +184,7 @@ class Inverse:
 
     def at(self, row: np.ndarray, acceleration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return R and the next activations at a state and an acceleration."""
-        mujoco.mj_setState(self.model, self.data, row, EVERY)
+        self._set(row)
         self.qacc[:] = acceleration
         found = self.residual() - self.applied()
         return found, self._next() if self.model.na else self.act.copy()
@@ -184,7 +198,7 @@ class Inverse:
         """
         model, data, found = self.model, self.data, []
         inverse = np.linalg.inv(matrix.T)
-        mujoco.mj_setState(model, data, row, EVERY)
+        self._set(row)
         for place in places:
             self.qpos[:], self.qacc[:] = place, acceleration
             self.qacc -= inverse @ (self.residual() - (force := self.applied()))
@@ -301,7 +315,11 @@ def step_of(
     every = ["qpos", "qvel", "act", *names]
     sizes = [found[name].shape[-2] for name in every]
     right = np.swapaxes(np.concatenate([found[name] for name in every], axis=-2), -1, -2)
-    change = -timestep * np.linalg.solve(np.swapaxes(found["qacc"], -1, -2), right)
+    matrices = np.swapaxes(found["qacc"], -1, -2)
+    try:
+        change = -timestep * np.linalg.solve(matrices, right)
+    except np.linalg.LinAlgError:  # of a motion that diverges
+        change = -timestep * np.linalg.pinv(np.where(np.isfinite(matrices), matrices, 0.0)) @ right
     change[..., nv : 2 * nv] += np.eye(nv)
     turned = timestep * speeds
     moved = layout.follow(turned, timestep * change)

@@ -122,8 +122,9 @@ class Worker:
         if given is not self.given:
             self.given, self.model, self.others = given, copy.deepcopy(given), None
             self.inverse, self.is_explicit = Inverse(self.model, self.layout), inverse.has_inverse(self.model)
-        self.surfaces = Surfaces(self.model, self.levers, speeds if gradient == "slope" else 0 * speeds)
-        self.far = mujoco.MjData(self.surfaces.model)
+            self.surfaces = Surfaces(self.model, self.levers)
+            self.far = mujoco.MjData(self.surfaces.model)
+        self.surfaces.widen(speeds if gradient == "slope" else 0 * speeds)
 
     def _together(self, steps: Steps, index: list[int]) -> None:
         """Write the derivatives of rows of one model: differences one by one, the algebra at once."""

@@ -52,7 +52,7 @@ class Layout:
         self.plain_dofs = np.flatnonzero(is_plain)
         self.plain_qpos = np.setdiff1d(np.arange(model.nq), self.quaternions.ravel())
 
-    def moved(self, rows: Float[np.ndarray, "*rows size"], change: Float[np.ndarray, "*rows some"]) -> np.ndarray:
+    def moved(self, rows: Float[np.ndarray, "... size"], change: Float[np.ndarray, "... some"]) -> np.ndarray:
         """Return states moved in tangent space: by their positions, or by all of a change."""
         rows = np.array(np.broadcast_to(rows, (*change.shape[:-1], rows.shape[-1])))
         first = self.places["qpos"].start
@@ -65,7 +65,7 @@ class Layout:
             rows[..., self.rest] += change[..., 2 * self.nv :]
         return rows
 
-    def difference(self, ends: Float[np.ndarray, "*rows size"], starts: Float[np.ndarray, "*rows size"]) -> np.ndarray:
+    def difference(self, ends: Float[np.ndarray, "... size"], starts: Float[np.ndarray, "... size"]) -> np.ndarray:
         """Return the changes that move starts to ends."""
         change = np.empty((*np.broadcast_shapes(ends.shape[:-1], starts.shape[:-1]), self.num_changes))
         first = self.places["qpos"].start
@@ -79,7 +79,7 @@ class Layout:
         change[..., 2 * self.nv :] = ends[..., self.rest] - starts[..., self.rest]
         return change
 
-    def carry(self, turned: Float[np.ndarray, "*rows nv"], values: Float[np.ndarray, "*rows nv columns"]) -> np.ndarray:
+    def carry(self, turned: Float[np.ndarray, "... nv"], values: Float[np.ndarray, "... nv columns"]) -> np.ndarray:
         """Return how changes of a position look after a turn: those of quaternions are seen from the turned body."""
         if not self.turns.size:
             return values
@@ -87,7 +87,7 @@ class Layout:
         values[..., self.turns, :] = np.swapaxes(_matrix(turned[..., self.turns]), -1, -2) @ values[..., self.turns, :]
         return values
 
-    def follow(self, turned: Float[np.ndarray, "*rows nv"], values: Float[np.ndarray, "*rows nv columns"]) -> np.ndarray:
+    def follow(self, turned: Float[np.ndarray, "... nv"], values: Float[np.ndarray, "... nv columns"]) -> np.ndarray:
         """Return how changes of a turn change the position after it: the right Jacobian of the exponential map."""
         if not self.turns.size:
             return values

@@ -46,49 +46,48 @@ def _random(scene):
     return qpos, qvel, act, rng.uniform(0.05, 0.6, model.nu)
 
 
-def _by_mujoco(scene, qpos, qvel, act, ctrl):
-    """Return A and B by MuJoCo's own differences, or by ours of `mj_step` where it has none."""
-    model, data = scene.mj_model, mujoco.MjData(scene.mj_model)
+def _by_steps(model, qpos, qvel, act, ctrl, width=1e-6):
+    """Return A and B by central differences of whole steps, each from a fresh MjData."""
     size = 2 * model.nv + model.na
-    A, B = np.zeros((size, size)), np.zeros((size, model.nu))
-    data.qpos, data.qvel, data.act, data.ctrl = qpos, qvel, act, ctrl
-    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
-        mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
-        return A, B
 
-    def step(change, push):
-        data.qpos, data.qvel, data.ctrl = qpos, qvel + change[model.nv :], ctrl + push
+    def step(change):
+        data = mujoco.MjData(model)
+        data.qpos, data.qvel, data.act = qpos, qvel + change[model.nv : 2 * model.nv], act + change[2 * model.nv : size]
+        data.ctrl = ctrl + change[size:]
         mujoco.mj_integratePos(model, data.qpos, change[: model.nv], 1.0)
         mujoco.mj_step(model, data)
-        return np.concatenate([data.qpos, data.qvel])  # all its coordinates are scalar
+        return data
 
-    for matrix, changes in ((A, np.eye(size)), (B, np.eye(model.nu))):
-        for column, one in enumerate(1e-6 * changes):
-            ends = [
-                step(s * one, np.zeros(model.nu)) if matrix is A else step(np.zeros(size), s * one) for s in (1, -1)
-            ]
-            matrix[:, column] = (ends[0] - ends[1]) / 2e-6
-    return A, B
+    columns = []
+    for change in width * np.eye(size + model.nu):
+        above, below = step(change), step(-change)
+        mujoco.mj_differentiatePos(model, moved := np.zeros(model.nv), 1.0, below.qpos, above.qpos)
+        columns.append(np.concatenate([moved, above.qvel - below.qvel, above.act - below.act]) / (2 * width))
+    both = np.transpose(columns)
+    return both[:, :size], both[:, size:]
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_one_step_is_that_of_mujocos_own_differences(name):
+def test_one_step_is_that_of_whole_steps(name):
     scene = mg.load_scene(SCENES[name], engine="mujoco")
     qpos, qvel, act, ctrl = _random(scene)
     found = mg.linearise(scene, mg.initial_state(scene, qpos, qvel, act), ctrl, contact=mg.Discrete())
-    for ours, theirs in zip((found.A, found.B), _by_mujoco(scene, qpos, qvel, act, ctrl), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-8 * max(1.0, np.abs(theirs).max(initial=0.0)))
+    expected = _by_steps(scene.mj_model, qpos, qvel, act, ctrl)
+    largest = max(np.abs(one).max(initial=0.0) for one in expected)
+    for ours, theirs in zip((found.A, found.B), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6 * largest)  # what differences of 1e-6 leave
 
 
-def test_the_solve_does_not_end_early_in_differences():
-    """At MuJoCo's default tolerance its own differences are off; ours are those of a solve that has ended."""
+def test_the_solve_does_not_end_early_in_derivatives():
+    """At MuJoCo's default tolerance differences of whole steps are off; ours are those of a solve that has ended."""
     coarse, fine = (
         mg.load_scene(SCENES["free box, pyramids"].replace(_SOLVER, solver), engine="mujoco")
         for solver in ("", _SOLVER)
     )
     qpos, qvel, act, ctrl = _random(fine)
     found = mg.linearise(coarse, mg.initial_state(coarse, qpos, qvel, act), ctrl, contact=mg.Discrete()).A
-    np.testing.assert_allclose(found, _by_mujoco(fine, qpos, qvel, act, ctrl)[0], atol=1e-6)
+    expected = _by_steps(fine.mj_model, qpos, qvel, act, ctrl)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
 HORIZON = 12

@@ -86,7 +86,8 @@ def test_the_motion_is_the_same_to_the_last_bit():
 
 def _events(xml, qpos, qvel, free=9.81):
     model = mujoco.MjModel.from_xml_string(xml)
-    surfaces = Surfaces(model, levers_of(model), np.array([qvel], float))
+    surfaces = Surfaces(model, levers_of(model))
+    surfaces.widen(np.array([qvel], float))
     data = mujoco.MjData(surfaces.model)
     data.qpos, data.qvel = qpos, qvel
     near = surfaces.near(data, np.array(qvel, float), np.array(qvel, float), np.full(model.nv, free))
@@ -278,9 +279,9 @@ def test_several_steps_at_once_are_those_of_a_rollout():
             last = mg.rollout(thicker, start, horizon=3, contact=mg.Slope("mujoco")).final
             return jnp.concatenate([last.qpos, last.qvel])
 
-        state = {"time": np.zeros((1, 1)), "qpos": place[None], "qvel": speed[None], "act": np.zeros((1, 0))}
-        how = {"gradient": "slope", "wanted": ("geom_size", "end"), "num_substeps": 3}
-        found = Engine(scene.mj_model).linearise({"geom_size": sizes}, state, {"ctrl": np.zeros((1, 0))}, **how)
+        state = {"time": np.zeros((1, 1)), "qpos": place[None], "qvel": speed[None]}
+        how = {"gradient": "slope", "wanted": ("geom_size",)}
+        found = Engine(scene.mj_model).product({"geom_size": sizes[None]}, state, {"ctrl": np.zeros((1, 3, 0))}, **how)
         by_speed, by_radius = jax.jacrev(course, (0, 1))(jnp.asarray(speed), jnp.asarray(sizes[1, 0]))
         np.testing.assert_allclose(found["state"][0, :, 3:], by_speed, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(found["geom_size"][0, :, 3], by_radius, rtol=1e-4, atol=1e-4)

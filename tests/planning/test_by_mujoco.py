@@ -66,13 +66,13 @@ def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):
 def test_an_iteration_asks_c_mujoco_twice(monkeypatch, system):
     """Once for all linear models, and once for all step lengths; a call for each step would be seen."""
     counts = collections.Counter()
-    for name in ("run", "steer", "linearise", "follow"):
+    for name in ("steer", "product", "follow"):
         monkeypatch.setattr(Engine, name, _counted(counts, name))
     controller, state = controller_of(system), np.asarray(start_of(system))
     controller(state)
     counts.clear()
     controller(state)
-    assert counts == {"steer": 2, "linearise": 2}
+    assert counts == {"steer": 2, "product": 2}
 
 
 def _counted(counts, name):
