@@ -64,6 +64,7 @@ from scipy.sparse.csgraph import connected_components
 from mjxgrad.bodies import tree
 
 _LEAST_WIDTH = 0.06  # of the impedance's width
+_STIRRED = 4.0  # steps of travel, beyond which a surface is not near
 _SMALLEST = 1e-6  # half of what is spanned (m or rad)
 HAIR = 6e-5
 """How far surfaces are moved to average the geometry of contacts (m)."""
@@ -203,7 +204,9 @@ class Surfaces:
             # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
             centres, widths = -self.lead * rate, _STAGES * widths
         fall = self.timestep**2 * np.abs(rows @ (self.kept * free))
-        widths = np.maximum(widths, np.minimum(least, np.maximum(fall, _SMALLEST)))
+        # A contact that rests crosses nothing, however near its surface it rests.
+        stirred = _STIRRED * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
+        widths = np.maximum(widths, np.minimum(least, np.maximum(np.minimum(fall, stirred), _SMALLEST)))
         is_rough &= gaps - centres < widths
         is_moved = self._moves(rows)
         is_undecided = jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)

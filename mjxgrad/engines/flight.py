@@ -33,7 +33,7 @@ from mjxgrad.engines.layout import Layout
 _NUM_ALIKE, _ALIKE = 3, 0.05
 _FAR = 10.0  # times the distance at first; a falling arm that bounces twice is off with 5
 _LONGEST = 100
-NUM_SLOTS = 24
+NUM_SLOTS = 96
 _STEPS = 10  # over which a difference of velocities is one of positions
 
 

@@ -73,6 +73,7 @@ class Inverse:
             or (model.opt.integrator in _IMPLICIT and depends.any())
         )
         self.is_coupled, self.is_pulled = is_coupled, False
+        self.is_implicit = model.opt.integrator in _IMPLICIT and model.nu > 0
         # The last entry is for -1, the vertices of flexible bodies.
         self.is_iterated = np.append(np.isin(model.geom_type, _ITERATED), True)
         self.has_iterated = bool(self.is_iterated[:-1].any()) or model.nflex > 0
@@ -84,9 +85,12 @@ class Inverse:
                 of_act[first : first + count], order[first : first + count] = actuator, np.arange(count)
         self.of_act, self.order = of_act, order
 
-    def _set(self, row: np.ndarray) -> None:
+    def _set(self, row: np.ndarray, acceleration: np.ndarray) -> None:
         mujoco.mj_setState(self.model, self.data, row, EVERY)
         self.is_pulled = bool(row[self.layout.places["xfrc_applied"]].any())
+        self.qacc[:] = acceleration
+        if self.is_implicit:
+            self.residual()  # the integrator's matrix asks which actuators are at their limits, as they last were
 
     def residual(self, skip: int = 0) -> Float[np.ndarray, " nv"]:
         """Return inverse dynamics less actuators of what is in `data`; stages before may be skipped."""
@@ -115,8 +119,7 @@ class Inverse:
             found: "qpos", "qvel", "qacc" of R; "act" and "ctrl", where there are such, of R and, as "next ...", of activations.
         """
         model, data = self.model, self.data
-        self._set(row)
-        self.qacc[:] = acceleration
+        self._set(row, acceleration)
         nothing = [None] * 6
         self._by_position(found["qpos"])
         mujoco.mjd_inverseFD(model, data, _WIDTH, True, None, found["qvel"], *nothing[:5])
@@ -184,8 +187,7 @@ class Inverse:
 
     def at(self, row: np.ndarray, acceleration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return R and the next activations at a state and an acceleration."""
-        self._set(row)
-        self.qacc[:] = acceleration
+        self._set(row, acceleration)
         found = self.residual() - self.applied()
         return found, self._next() if self.model.na else self.act.copy()
 
@@ -198,7 +200,7 @@ class Inverse:
         """
         model, data, found = self.model, self.data, []
         inverse = np.linalg.inv(matrix.T)
-        self._set(row)
+        self._set(row, acceleration)
         for place in places:
             self.qpos[:], self.qacc[:] = place, acceleration
             self.qacc -= inverse @ (self.residual() - (force := self.applied()))

@@ -139,8 +139,8 @@ class Worker:
         explicit = [(k, one) for k, _, one in done if one.is_explicit]
         self._assemble(raw, explicit, names)
         for k, i, one in done:
-            if steps.gradient == "discrete" and one.is_explicit and self._steepness(one.found["state"]) > _STEEP / self.model.opt.timestep:
-                self._beside(steps, i, one, names)
+            if one.is_explicit and self._is_steep(one):
+                self._beside(steps.gradient, one, names)
             self._with_events(one, names)
             if one.begun is not None:
                 steps.begun[i] = one.begun
@@ -217,15 +217,26 @@ class Worker:
         if shift is not None:
             self._move(one, shift)
 
-    def _beside(self, steps: Steps, i: int, one: _Row, names: list[str]) -> None:
-        """Differentiate a step anew whose differences are too steep to be of a contact."""
-        self._aside(one)
-        if one.clear is not one.before or one.by is not self.inverse:
-            raw = {name: value[None] for name, value in one.raw.items()}
-            for value in raw.values():
-                value[:] = 0.0
-            self._differentiate(one, names)
-            self._assemble(raw, [(0, one)] * one.is_explicit, names)
+    def _is_steep(self, one: _Row) -> bool:
+        """Return whether differences are steeper than any contact, so that they step over a jump."""
+        return not self._steepness(one.found["state"]) <= _STEEP / self.model.opt.timestep
+
+    def _beside(self, gradient: Gradient, one: _Row, names: list[str]) -> None:
+        """Differentiate a step anew whose differences are too steep: from beside, and at last by whole steps."""
+        if gradient == "discrete":
+            self._aside(one)
+            if one.clear is not one.before or one.by is not self.inverse:
+                raw = {name: value[None] for name, value in one.raw.items()}
+                for value in raw.values():
+                    value[:] = 0.0
+                self._differentiate(one, names)
+                self._assemble(raw, [(0, one)] * one.is_explicit, names)
+        if one.is_explicit and self._is_steep(one):
+            kept = {name: one.found[name].copy() for name in ("state", "ctrl") if name in one.found}
+            self._by_steps(one)
+            if not self._steepness(one.found["state"]) < 0.5 * self._steepness(kept["state"]):
+                for name, value in kept.items():
+                    one.found[name][:] = value
 
     def _decide(self, one: _Row) -> None:
         """Take the model in which gaps of the size of rounding are as they were in the step."""
