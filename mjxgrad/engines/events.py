@@ -59,7 +59,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import connected_components
 
 from mjxgrad.bodies import tree
 
@@ -343,10 +342,9 @@ def _by_modes(
 ) -> Events | None:
     """Return the chosen rows as events, with displacements that change one mode each and carry no other row across zero."""
     scaled, index = rows / lengths, np.flatnonzero(chosen)
-    moved = ((rows != 0) & is_contact[:, None])[index].astype(float)
-    _, group = connected_components(moved @ moved.T, directed=False)
+    group = _connected(((rows != 0) & is_contact[:, None])[index])
     patterns, widest, groups = [], [], []
-    for one in range(group.max() + 1):
+    for one in np.unique(group):
         own = np.flatnonzero(group == one)
         left, sizes, _ = np.linalg.svd(scaled[index[own]], full_matrices=False)
         largest = np.abs(left).max(axis=0)
@@ -385,6 +383,15 @@ def _by_modes(
         weights,
         index,
     )
+
+
+def _connected(moved: Bool[np.ndarray, "rows nv"]) -> Int[np.ndarray, " rows"]:
+    """Return a number for each row, the same where rows share coordinates, directly or by others."""
+    shares = (moved.astype(float) @ moved.T > 0) | np.eye(len(moved), dtype=bool)
+    group = np.arange(len(moved))
+    while not np.array_equal(group, least := np.where(shares, group, len(group)).min(axis=1)):
+        group = least
+    return group
 
 
 def _independent(rows: _Rows, others: Float[np.ndarray, "others nv"]) -> list[int]:

@@ -192,11 +192,14 @@ def _advance(
     before = flight.apart[motions, slots]
     expected = (course.matrices[motions, t] @ before[..., None])[..., 0]
     off = np.linalg.norm(scale * (apart - expected), axis=-1)
-    for k, motion in enumerate(motions.tolist()):
-        if (one := course.begun.get((motion, t))) is not None:
-            felt = one.felt @ before[k]
-            ways = [one.apart.T @ felt] + ([] if one.lost is None else [one.lost @ felt])
-            off[k] = min(np.linalg.norm(scale * (apart[k] - expected[k] - way)) for way in ways)
+    # Pairs of a motion follow each other.
+    first = np.flatnonzero(np.diff(motions, prepend=-1))
+    for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(motions)], strict=True):
+        if (one := course.begun.get((int(motions[begin]), t))) is not None:
+            own = slice(begin, end)
+            felt, left = before[own] @ one.felt.T, apart[own] - expected[own]
+            ways = [felt @ one.apart] + ([] if one.lost is None else [felt @ one.lost.T])
+            off[own] = np.min([np.linalg.norm(scale * (left - way), axis=-1) for way in ways], axis=0)
     is_sound = np.isfinite(apart).all(axis=-1) & course.is_finite[motions, t]
     known = off <= _ALIKE * np.linalg.norm(scale * apart, axis=-1)
     flight.alike[motions, slots] = np.where(known, flight.alike[motions, slots] + 1, 0)

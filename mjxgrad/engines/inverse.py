@@ -72,6 +72,9 @@ class Inverse:
             or model.tendon_actfrclimited.any()
             or (model.opt.integrator in _IMPLICIT and depends.any())
         )
+        self.filters = model.geom_contype, model.body_contype, model.geom_conaffinity, model.body_conaffinity
+        self.filtered = [one.copy() for one in self.filters]
+        self.touching = [np.zeros_like(one) for one in self.filters[:2]]
         self.is_coupled, self.is_pulled = is_coupled, False
         self.is_implicit = model.opt.integrator in _IMPLICIT and model.nu > 0
         # The last entry is for -1, the vertices of flexible bodies.
@@ -141,14 +144,25 @@ class Inverse:
         return bool(off @ off <= _RESIDUAL**2 * max(sum(one @ one for one in forces), _TINY))
 
     def _by_position(self, found: np.ndarray) -> None:
+        """Write differences by positions, with those geoms alone that touch: no others come to touch within a width."""
         model, data = self.model, self.data
-        if not (data.ncon and self._is_iterative(np.asarray(data.contact.geom).reshape(-1, 2))):
+        geoms = np.asarray(data.contact.geom).reshape(-1, 2) if data.ncon else None
+        if not model.nflex:
+            for touching, owners in zip(self.touching, (None, model.geom_bodyid), strict=True):
+                touching[:] = 0
+                if geoms is not None:
+                    touching[geoms if owners is None else owners[geoms]] = 1
+            for one, before, touching in zip(self.filters, self.filtered, 2 * self.touching, strict=True):
+                np.multiply(before, touching, out=one)
+        if geoms is None or not self._is_iterative(geoms):
             mujoco.mjd_inverseFD(model, data, _NARROW if data.nefc else _FREE, True, found, *[None] * 6)
-            return
-        mujoco.mjd_inverseFD(model, data, _WIDTH, True, found, *[None] * 6)
-        mujoco.mjd_inverseFD(model, data, -_WIDTH, True, other := np.empty_like(found), *[None] * 6)
-        found += other
-        found *= 0.5
+        else:
+            mujoco.mjd_inverseFD(model, data, _WIDTH, True, found, *[None] * 6)
+            mujoco.mjd_inverseFD(model, data, -_WIDTH, True, other := np.empty_like(found), *[None] * 6)
+            found += other
+            found *= 0.5
+        for one, before in zip(self.filters, self.filtered, strict=True):
+            one[:] = before
 
     def _is_iterative(self, geoms: np.ndarray) -> bool:
         """Return whether some pair of geoms has a contact that is found by iterations."""

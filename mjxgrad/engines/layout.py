@@ -16,7 +16,7 @@ MOTION = ("qpos", "qvel", "act", "history", "plugin")
 """What goes on from step to step, beside time."""
 _STATE = mujoco.mjtState
 USER = _STATE.mjSTATE_USER.value & ~_STATE.mjSTATE_USERDATA.value
-PHYSICS, EVERY = _STATE.mjSTATE_FULLPHYSICS.value, _STATE.mjSTATE_INTEGRATION.value
+EVERY = _STATE.mjSTATE_INTEGRATION.value
 _QUATERNIONS = {mujoco.mjtJoint.mjJNT_FREE.value: 3, mujoco.mjtJoint.mjJNT_BALL.value: 0}
 _SMALL = 1e-4  # rad, below which series replace quotients
 

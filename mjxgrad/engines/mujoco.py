@@ -16,7 +16,7 @@ from mjxgrad._warnings import collected
 from mjxgrad.engines.events import levers_of
 from mjxgrad.engines.flight import NUM_SLOTS, Course, Flight, fly
 from mjxgrad.engines.jacobians import Steps, Worker, solved, with_pairs
-from mjxgrad.engines.layout import EVERY, MOTION, PHYSICS, USER, Layout
+from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
 from mjxgrad.engines.stepmap import FIRST, PAIRS, advance
 from mjxgrad.scene.scene import with_numbers
 from mjxgrad.stepping import Gradient
@@ -100,9 +100,7 @@ class Engine:
 
     def _together(self, rows: np.ndarray, models: list[mujoco.MjModel], given: np.ndarray, **how: np.ndarray) -> np.ndarray:
         """Return physical states after each step of several motions at once."""
-        full = np.zeros((len(rows), mujoco.mj_stateSize(self.mj_model, PHYSICS)))
-        for row, part in zip(rows, full, strict=True):
-            mujoco.mj_extractState(self.mj_model, row, EVERY, part, PHYSICS)
+        full = np.concatenate([rows[:, self.places[name]] for name in START], axis=1)
         return np.asarray(self.pool.rollout(models, self.memory, full, given, control_spec=USER, **how)[0])
 
     def _motions(self, found: np.ndarray) -> dict[str, np.ndarray]:
@@ -186,6 +184,10 @@ class Engine:
     ) -> dict[str, np.ndarray]:  # fmt: skip
         num, steps = inputs["ctrl"].shape[:2]
         rows = self._rows({k: v.reshape(num * steps, *v.shape[2:]) for k, v in {**before, **inputs}.items()})
+        every = rows.reshape(num, steps, -1)
+        speeds = every[..., self.places["qvel"]]
+        # Nearly the acceleration that a solve will find.
+        every[:, :-1, self.places["warmstart"]] = np.diff(speeds, axis=1) / self.mj_model.opt.timestep
         exact = {id(model): self._exact(model) for model in models}
         every = [exact[id(model)] for model in models for _ in range(steps)]
         shapes = self.shapes(wanted, sizes)
