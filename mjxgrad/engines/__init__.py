@@ -2,6 +2,6 @@
 
 from mjxgrad.engines.layout import INPUTS, MOTION
 from mjxgrad.engines.mujoco import engine_of
-from mjxgrad.engines.rule import linearise, product, roll_out, steer, to_coordinates
+from mjxgrad.engines.rule import linearise, product, roll_out, sense, steer, to_coordinates
 
-__all__ = ["INPUTS", "MOTION", "engine_of", "linearise", "product", "roll_out", "steer", "to_coordinates"]
+__all__ = ["INPUTS", "MOTION", "engine_of", "linearise", "product", "roll_out", "sense", "steer", "to_coordinates"]

@@ -32,6 +32,7 @@ _NOTHING = 1e-9  # of a displacement by one
 _STEEP, _NARROWER = 10.0, 1 / 30
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 _OF_TIME = "opt.timestep"
+_KINK = 0.1  # of a derivative, by which its two sides differ at most
 
 _TOGETHER = 64  # rows whose algebra is done at once
 
@@ -274,8 +275,6 @@ class Worker:
         if not one.is_explicit:
             self._by_steps(one)
         self._by_others(one, names[1:])
-        if "C" in one.found:
-            self._sensors(one)
 
     def _with_events(self, one: _Row, names: list[str]) -> None:
         """Replace what small differences have along the displacements of events, and average the geometry of edges."""
@@ -372,66 +371,89 @@ class Worker:
         nv = len(lengths)
         return np.abs(matrix[nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(initial=0.0)
 
-    def _sensors(self, one: _Row) -> None:
-        """Write differences of sensors by state and controls."""
-        model, data, place = one.by.model, one.by.data, self.layout.places["ctrl"]
-        num = 2 * model.nv + model.na
-        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4 and num == self.layout.num_changes:
-            mujoco.mj_setState(model, data, one.clear, EVERY)
-            mujoco.mjd_transitionFD(model, data, _WIDTH, True, None, None, one.found["C"], one.found["D"])
-            return
-        starts = [self.layout.moved(one.clear, side * _WIDTH * np.eye(self.layout.num_changes)) for side in (1, -1)]
-        for name, (above, below) in (("C", starts), ("D", [one.clear + side * _WIDTH * np.eye(len(one.clear))[place] for side in (1, -1)])):
-            for column, pair in enumerate(zip(above, below, strict=True)):
-                ends = [(self._step(one.by, start), data.sensordata.copy())[1] for start in pair]
-                one.found[name][:, column] = (ends[0] - ends[1]) / (2 * _WIDTH)
+    @np.errstate(invalid="ignore", over="ignore", divide="ignore")
+    def sense(self, steps: Steps, index: list[int]) -> None:
+        """Write the readings of sensors in states, or their derivatives by "state" and all else that is wanted."""
+        for i in index:
+            self._use(steps.models[i], steps.speeds[id(steps.models[i])], "discrete")
+            row, found = steps.rows[i], {name: value[i] for name, value in steps.found.items()}
+            if not np.isfinite(row).all():
+                continue
+            if "readings" in found:
+                found["readings"][:] = self._read(row)
+            else:
+                self._by_sensors(row, found)
+
+    def _read(self, row: np.ndarray) -> Float[np.ndarray, " sensors"]:
+        model, data = self.inverse.model, self.inverse.data
+        mujoco.mj_setState(model, data, row, EVERY)
+        mujoco.mj_forward(model, data)
+        return data.sensordata.copy()
+
+    def _by_sensors(self, row: np.ndarray, found: _Found) -> None:
+        """Write small differences of sensors by state, controls, other inputs and numbers."""
+        model, data, place = self.inverse.model, self.inverse.data, self.layout.places["ctrl"]
+        by_state, by_control = found["state"], found.get("ctrl", np.zeros((model.nsensordata, model.nu)))
+        if self.layout.num_changes == 2 * model.nv + model.na and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+            mujoco.mj_setState(model, data, row, EVERY)
+            mujoco.mjd_transitionFD(model, data, _WIDTH, True, None, None, by_state, by_control)
+        else:
+            changes = _WIDTH * np.eye(self.layout.num_changes)
+            starts = [(by_state, self.layout.moved(row, changes), self.layout.moved(row, -changes))]
+            starts += [(by_control, row + (change := _WIDTH * np.eye(len(row))[place]), row - change)]
+            for matrix, *sides in starts:
+                for column, (above, below) in enumerate(zip(*sides, strict=True)):
+                    matrix[:, column] = (self._read(above) - self._read(below)) / (2 * _WIDTH)
+        for name in (one for one in found if is_other(one)):
+            for column, (put, size, is_zero) in enumerate(self._changes(self.inverse, row, name)):
+                read = lambda amount, put=put: self._read(put(amount))  # noqa: E731
+                found[name][:, column] = _derivative(read, size, is_zero)
+                put(0.0)
 
     def _by_others(self, one: _Row, names: list[str]) -> None:
         """Write differences by inputs beside controls and by numbers of the model; what moves gaps has its share of events."""
         for name in names:
             events = one.events if moves_gaps(name) else None
             shares = np.zeros((0 if events is None else len(events.widths), one.found[name].shape[1]))
-            for column, (put, size) in enumerate(self._changes(one, name)):
+            for column, (put, size, is_zero) in enumerate(self._changes(one.by, one.clear, name)):
                 shift = np.zeros(self.layout.nv)
                 if events is not None:
                     shares[:, column] = self._rates(put, size, events)
                     shift = -events.moves @ shares[:, column]
-                starts = [self.layout.moved(put(side), side * shift) for side in (size, -size)]
-                if one.is_explicit and name != _OF_TIME:
-                    sides = [one.by.at(put_again, one.acceleration) for put_again in self._each(put, starts, size)]
-                    change = [(above - below) / (2 * size) for above, below in zip(*sides, strict=True)]
-                    one.raw[name][column], one.raw[f"next {name}"][column] = change
+                by_solution = one.is_explicit and name != _OF_TIME
+
+                def end(amount: float, put: Callable = put, shift: np.ndarray = shift, by_solution: bool = by_solution) -> np.ndarray:
+                    start = self.layout.moved(put(amount), amount * shift)
+                    if by_solution:
+                        return np.concatenate(one.by.at(start, one.acceleration))
+                    return self.layout.difference(self._step(one.by, start), one.after)
+
+                change = _derivative(end, size, is_zero)
+                put(0.0)
+                if by_solution:
+                    one.raw[name][column], one.raw[f"next {name}"][column] = np.split(change, [self.layout.nv])
                     one.raw[f"shift {name}"][column] = shift
                 else:
-                    ends = [self._step(one.by, start) for start in self._each(put, starts, size)]
-                    one.found[name][:, column] = self.layout.difference(*ends) / (2 * size)
-                put(0.0)
+                    one.found[name][:, column] = change
             if one.begun is not None and events is not None:
                 one.begun.by_others[name] = shares
 
-    @staticmethod
-    def _each(put: Callable, starts: list[np.ndarray], size: float) -> Iterator[np.ndarray]:
-        """Give states while what is put is as it belongs to them."""
-        for start, side in zip(starts, (size, -size), strict=True):
-            put(side)
-            yield start
-
-    def _changes(self, one: _Row, name: str) -> Iterator[tuple[Callable[[float], np.ndarray], float]]:
-        """Give for each entry a function of an amount to the state that it changes so, and a small amount.
+    def _changes(self, by: Inverse, row: np.ndarray, name: str) -> Iterator[tuple[Callable[[float], np.ndarray], float, bool]]:
+        """Give for each entry a function of an amount to the state that it changes so, a small amount, and whether it is zero.
 
         Numbers of the model change here and where gaps are measured.
         """
         if name in INPUTS:
             place, size = self.layout.places[name], min(_WIDTH, HAIR) if moves_gaps(name) else _WIDTH
             for entry in range(place.start, place.stop):
-                yield functools.partial(_with_entry, one.clear, entry), size
+                yield functools.partial(_with_entry, row, entry), size, False
             return
-        attribute, both = name.removeprefix("opt."), (one.by.model, self.surfaces.model)
+        attribute, both = name.removeprefix("opt."), (by.model, self.surfaces.model)
         holders = [model.opt for model in both] if name.startswith("opt.") else both
         present = [np.array(getattr(holder, attribute, []), float).reshape(-1) for holder in holders]
         for entry, values in enumerate(np.transpose(present).tolist()):
-            change = functools.partial(_with_number, one.clear, holders, attribute, entry, values)
-            yield change, 10 * _WIDTH * abs(values[0]) or _WIDTH
+            change = functools.partial(_with_number, row, holders, attribute, entry, values)
+            yield change, 10 * _WIDTH * abs(values[0]) or _WIDTH, values[0] == 0.0
 
     def _rates(self, put: Callable[[float], np.ndarray], size: float, events: Events) -> Float[np.ndarray, " modes"]:
         """Return by how much the modes of events change with what is put."""
@@ -450,6 +472,31 @@ class Worker:
         mujoco.mj_step(by.model, by.data)
         mujoco.mj_getState(by.model, by.data, end := np.empty_like(row), EVERY)
         return end
+
+
+def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) -> np.ndarray:
+    """Return the derivative by an amount. A number that is zero may be a switch, which no small amount may turn on.
+
+    Where both sides differ, the amount's own side counts if half of the amount does half as much, and nothing if not.
+    """
+
+    def at(amount: float) -> np.ndarray | None:
+        try:
+            return end(amount)
+        except mujoco.FatalError:  # not a model that MuJoCo steps
+            return None
+
+    above, below = at(size), at(-size)
+    if above is None or (below is None and not is_zero):
+        return 0.0 * end(0.0)
+    if not is_zero:
+        return (above - below) / (2 * size)
+    middle = end(0.0)
+    up, down = (above - middle) / size, None if below is None else (middle - below) / size
+    if down is not None and np.linalg.norm(up - down) <= _KINK * max(np.linalg.norm(up), np.linalg.norm(down)):
+        return 0.5 * (up + down)
+    half = (end(size / 2) - middle) / (size / 2)
+    return up if np.linalg.norm(half - up) <= _KINK * np.linalg.norm(up) else 0.0 * up
 
 
 def _with_entry(row: np.ndarray, entry: int, amount: float) -> np.ndarray:
@@ -484,4 +531,4 @@ def moves_gaps(name: str) -> bool:
 
 def is_other(name: str) -> bool:
     """Return whether a derivative is by an input beside controls or by numbers of the model."""
-    return " " not in name and name not in {"state", "ctrl", "C", "D", *PAIRS, *FIRST}
+    return " " not in name and name not in {"state", "ctrl", *PAIRS, *FIRST}

@@ -158,8 +158,6 @@ class Engine:
     ) -> dict[str, np.ndarray]:  # fmt: skip
         """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted.
 
-        Those of the sensors, "C" and "D", are of small differences with either gradient.
-
         Args:
             numbers: of the model, that differ from the file's.
             before: states before each step, with an axis of steps as inputs have it.
@@ -217,6 +215,29 @@ class Engine:
                     ends[np.ix_(chosen, self.layout.motion)] = self._steps(ends[chosen], [models[k] for k in chosen])
                 found["flight"] = pairs.packed(self.layout, ends)
         return found
+
+    def sense(
+        self, numbers: _Arrays, states: _Arrays, inputs: _Arrays, *, wanted: tuple[str, ...] = ()
+    ) -> dict[str, np.ndarray]:
+        """Return the "readings" of all sensors in states, or their derivatives by "state" and what else is wanted.
+
+        States and inputs have an axis of times. Differences are small ones: sensors do not know of events.
+        """
+        with self.lock, collected():
+            batch, models, states, inputs = self._flat(np.ndim(states["time"]) - 2, numbers, states, inputs)
+            num, times = inputs["ctrl"].shape[:2]
+            rows = self._rows({k: v.reshape(num * times, *v.shape[2:]) for k, v in {**states, **inputs}.items()})
+            exact = {id(model): self._exact(model) for model in models}
+            every = [exact[id(model)] for model in models for _ in range(times)]
+            sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()} | {"state": self.layout.num_changes}
+            sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
+            count = self.mj_model.nsensordata
+            shapes = {name: (count, sizes[name]) for name in wanted} or {"readings": (count,)}
+            found = {name: np.zeros((len(rows), *shape)) for name, shape in shapes.items()}
+            still = {id(one): np.zeros((1, self.layout.nv)) for one in every}
+            work = Steps(rows, every, still, "discrete", found, np.zeros(len(rows), bool))
+            self._share(lambda worker, piece: worker.sense(work, piece), self.workers, len(rows))
+        return {name: value.reshape(*batch, times, *value.shape[1:]) for name, value in found.items()}
 
     def product(
         self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]
@@ -288,13 +309,12 @@ class Engine:
         return NUM_SLOTS, 2 * self.layout.num_changes + 3
 
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the derivatives of one step: of its end by all that is wanted, and of its sensors, "C" and "D".
+        """Return the shapes of the derivatives of one step, of its end by all that is wanted.
 
         Of a whole motion are those of `ONCE`.
         """
         model, size = self.mj_model, self.layout.num_changes
-        own = {"C": (model.nsensordata, size), "D": (model.nsensordata, model.nu)}
-        own |= {"felt": (model.nv, size), "slot": (model.nv,), "apart": (size, NUM_SLOTS), "stays": (NUM_SLOTS,)}
+        own = {"felt": (model.nv, size), "slot": (model.nv,), "apart": (size, NUM_SLOTS), "stays": (NUM_SLOTS,)}
         own |= {"before": (size, NUM_SLOTS), "enters": (NUM_SLOTS,), "flight": self.flight_shape}
         own |= {k: (model.nv if k.startswith("felt") else size, sizes[k.split()[-1]]) for k in wanted if k not in own}
         return {"state": (size, size)} | {k: own[k] for k in wanted}

@@ -121,12 +121,51 @@ def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient
     return _once(function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
 
 
-def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]) -> dict[str, Array]:
-    """Return the derivatives of one step by "state" and all that is wanted, see `Engine.maps`."""
+def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient) -> tuple[Array, Array, Array, Array]:
+    """Return the derivatives of one step and of its sensors by state and controls: A, B, C and D."""
     engine, before = engine_of(scene.mj_model), {name: x[None] for name, x in start.items()}
-    flight = jnp.zeros(engine.flight_shape, start["qpos"].dtype)
-    found = _maps(engine, changed_numbers(scene), before, inputs, flight, gradient=gradient, wanted=wanted)
-    return {name: value[0] for name, value in found.items()}
+    numbers, dtype, size = changed_numbers(scene), start["qpos"].dtype, engine.layout.num_changes
+    flight = jnp.zeros(engine.flight_shape, dtype)
+    found = _maps(engine, numbers, before, inputs, flight, gradient=gradient, wanted=("ctrl",))
+    shapes = {"state": (1, scene.mj_model.nsensordata, size), "ctrl": (1, scene.mj_model.nsensordata, scene.mj_model.nu)}
+    sensed = _once(functools.partial(engine.sense, wanted=("state", "ctrl")), shapes, dtype, numbers, before, inputs)
+    return found["state"][0], found["ctrl"][0], sensed["state"][0], sensed["ctrl"][0]
+
+
+def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times nsensordata"]:
+    """Return the readings of all sensors in states under inputs, both with an axis of times; differentiable once."""
+    engine, dtype = engine_of(scene.mj_model), states["qpos"].dtype
+    times, count = len(inputs["ctrl"]), scene.mj_model.nsensordata
+
+    @jax.custom_jvp
+    def call(numbers: _Arrays, states: _Arrays, inputs: _Arrays) -> Array:
+        shapes = {"readings": jax.ShapeDtypeStruct((times, count), dtype)}
+        return _callback(engine.sense, shapes, numbers, states, inputs)["readings"]
+
+    @functools.partial(call.defjvp, symbolic_zeros=True)
+    def _derivative(primals, tangents) -> tuple[Array, Array]:
+        numbers, states, inputs = primals
+        by_number, by_state, by_input = tangents
+        given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
+        sizes = {name: primal[name].size // (times if primal is inputs else 1) for primal in (inputs, numbers) for name in primal}
+        sizes["state"] = engine.layout.num_changes
+        wanted = ("state", *given)
+        shapes = {name: (times, count, sizes[name]) for name in wanted}
+        found = _once(functools.partial(engine.sense, wanted=wanted), shapes, dtype, numbers, states, inputs)
+        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
+
+        def in_tangent_space(qpos: Array, change: Array) -> Array:
+            return jax.jvp(functools.partial(position_change, scene.model, qpos), (qpos,), (change,))[1]
+
+        parts = [jax.vmap(in_tangent_space)(states["qpos"], zero(by_state["qpos"]))]
+        parts += [zero(by_state[name]) for name in MOTION[1:]]
+        change = jnp.einsum("tsc,tc->ts", found["state"], jnp.concatenate(parts, axis=1), precision="highest")
+        for name, tangent in given.items():
+            own = tangent.reshape((times, -1) if name in by_input else -1).astype(dtype)
+            change += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", found[name], own, precision="highest")
+        return call(*primals), change
+
+    return call(changed_numbers(scene), dict(states), dict(inputs))
 
 
 def _maps(engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any) -> dict[str, Array]:

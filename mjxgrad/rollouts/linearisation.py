@@ -49,9 +49,8 @@ def linearise(
     if native is not None:
         start, resting = arguments_of(scene, state)
         inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
-        found = by_mujoco(scene, start, inputs, gradient=native.gradient, wanted=("ctrl", "C", "D"))
+        A, B, C, D = by_mujoco(scene, start, inputs, gradient=native.gradient)
         size = 2 * scene.model.nv + scene.model.na  # histories of delays come after
-        A, B, C, D = (found[name] for name in ("state", "ctrl", "C", "D"))
         return Linearisation(A[:size, :size], B[:size], C[:, :size], D)
     nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
     end = step(scene.model, data_of(scene, state, ctrl), contact=contact)

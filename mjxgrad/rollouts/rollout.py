@@ -24,6 +24,7 @@ from mjxgrad.contact.collision import first_missed, slot_geoms
 from mjxgrad.engines import roll_out
 from mjxgrad.rollouts import arguments
 from mjxgrad.rollouts.arguments import Observe, Policy, Sees, one_each
+from mjxgrad.rollouts.observation import observed
 from mjxgrad.rollouts.state import Pairs, State, Trajectory, complete, data_of, direction, is_sound, state_of
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
@@ -63,7 +64,7 @@ def rollout(
         horizon: number of steps; needed only where neither controls nor noise determine it.
         observe: called as `observe(model, data)` with the complete data of every state, including contacts and forces; its
             results are stacked, and only these are kept. `mg.sensor`, `mg.site_position` and `mg.contact_force` read
-            things by name.
+            things by name. C MuJoCo gives `sensordata` and the places of bodies, geoms and sites; else there is NaN.
         policy_sees: "state", or "observations": the policy then receives the result of `observe` in place of the state.
             Forces and accelerations are those under the previous control, in the first step under the scene's resting one.
             Observing them takes a second solve per step.
@@ -79,9 +80,8 @@ def rollout(
             forward mode.
 
     Raises:
-        ValueError: if contact is none of the four records, C MuJoCo is to observe, shapes do not fit the scene, the horizon
-            is missing or contradicted, or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as
-            diverged at this step).
+        ValueError: if contact is none of the four records, shapes do not fit the scene, the horizon is missing or contradicted,
+            or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as diverged at this step).
     """
     arguments.check_start(scene, state)
     native = arguments.native_motion(scene, contact)
@@ -99,11 +99,10 @@ def rollout(
     forces = arguments.applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     if native is not None:
-        if observe is not None:
-            raise ValueError("observe must be left out where C MuJoCo steps, which gives states alone, got one")
         added = jnp.zeros(base.shape, state.qvel.dtype) if noise is None else jnp.asarray(noise)
         given = (base + added if policy is None else policy, params, added, forces, native.gradient)
-        return _by_mujoco(scene, state, *given, measure_growth=measure_growth)
+        looks = {"observe": observe, "policy_sees": policy_sees}
+        return _by_mujoco(scene, state, *given, **looks, measure_growth=measure_growth)
     rows = (base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     ways = (policy_sees, checkpoint, contact, measure_growth)
     scan = _Scan(scene, policy, params if policy is not None else None, observe, *ways)
@@ -257,41 +256,62 @@ def _by_mujoco(
     inputs: _Inputs,
     gradient: Gradient,
     *,
+    observe: Observe | None,
+    policy_sees: Sees,
     measure_growth: bool,
 ) -> Trajectory:
     """Return C MuJoCo's rollout under controls, noise included, or a policy; the last good state is held."""
-    given, state = state, complete(scene, state)
+    given, state, seen = state, complete(scene, state), None
     if not callable(controls):
         found = _course(scene, state, controls, inputs, gradient)
     else:
+        looks = policy_sees == "observations"
 
-        def advance(carry: tuple[State, Array], given: tuple[Array, Array, _Inputs]) -> tuple:
-            state, first_bad = carry
+        def advance(carry: tuple[State, Array, Array], given: tuple[Array, Array, _Inputs]) -> tuple:
+            state, first_bad, before = carry
             index, disturbance, row = given
-            ctrl = one_each(controls(params, state), scene.model.nu) + disturbance
-            one = _course(scene, state, ctrl[None], jax.tree.map(lambda x: x[None], row), gradient)
+            seen = observed(scene, state, before, row, observe) if looks else None
+            ctrl = one_each(controls(params, seen if looks else state), scene.model.nu) + disturbance
+            one, _ = _course(scene, state, ctrl[None], jax.tree.map(lambda x: x[None], row), gradient)
             first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
             moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
-            return (moved, first_bad), ((state.qpos, state.qvel, state.act), ctrl)
+            return (moved, first_bad, ctrl.astype(before.dtype)), ((state.qpos, state.qvel, state.act, state.history), ctrl, seen)
 
         # Step by step, since each control depends on the state before it.
         rows = (jnp.arange(len(noise), dtype=jnp.int32), noise, inputs)
-        (final, first_bad), (states, ctrl) = jax.lax.scan(advance, (state, jnp.int32(-1)), rows)
-        last = (final.qpos, final.qvel, final.act)
+        first = (state, jnp.int32(-1), scene.data.ctrl)
+        (final, first_bad, _), (states, ctrl, seen) = jax.lax.scan(advance, first, rows)
+        last = (final.qpos, final.qvel, final.act, final.history)
         states = [jnp.concatenate([x, end[None]]) for x, end in zip(states, last, strict=True)]
-        found = _trajectory(states, final, ctrl, first_bad)
+        found = _trajectory(states, final, ctrl, first_bad), states[3]
+    found, history = found
     growth = _growth(scene, state, found.ctrl, inputs, gradient) if measure_growth else None
+    observations = None
+    if observe is not None:
+        observations = _observations(scene, state, found, history, inputs, observe)
     # What a scan carries has to look as it did.
     final = found.final if given.pairs is not None else dataclasses.replace(found.final, pairs=None)
     final = final if given.history.size == final.history.size else dataclasses.replace(final, history=given.history)
-    return dataclasses.replace(found, growth=growth, final=final)
+    return dataclasses.replace(found, growth=growth, final=final, observations=observations, seen=seen)
+
+
+def _observations(
+    scene: Scene, start: State, found: Trajectory, history: Float[Array, "states _"], inputs: _Inputs, observe: Observe
+) -> PyTree:
+    """Return what is observed in each state of a motion, the last one under the last control."""
+    assert found.act is not None
+    steps = jnp.minimum(jnp.arange(len(found.qpos)), len(found.ctrl) - 1)
+    time = start.time + scene.model.opt.timestep * jnp.arange(len(found.qpos))
+    states = jax.vmap(State)(found.qpos, found.qvel, found.act, time, jnp.zeros_like(found.qvel), history)
+    look = lambda state, ctrl, row: observed(scene, state, ctrl, row, observe)  # noqa: E731
+    return jax.vmap(look)(states, found.ctrl[steps], jax.tree.map(lambda x: x[steps], inputs))
 
 
 @eqx.filter_jit
 def _course(
     scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: _Inputs, gradient: Gradient
-) -> Trajectory:
-    """Return the motion under known controls: one call of C MuJoCo."""
+) -> tuple[Trajectory, Float[Array, "states _"]]:
+    """Return the motion under known controls, and what else goes on: one call of C MuJoCo."""
     is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
     start, resting = arguments.arguments_of(scene, state)
     assert state.pairs is not None
@@ -310,11 +330,11 @@ def _course(
     pairs = Pairs(found["flight"], found["held"])
     pairs = jax.tree.map(lambda x: jnp.where(first_bad >= 0, 0.0, x), pairs)
     final = State(qpos[-1], qvel[-1], act[-1], time, found["warmstart"], history[-1], pairs)
-    return _trajectory((qpos, qvel, act), final, ctrl, first_bad)
+    return _trajectory((qpos, qvel, act), final, ctrl, first_bad), history
 
 
 def _trajectory(states: Sequence[Array], final: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]) -> Trajectory:
-    qpos, qvel, act = states
+    qpos, qvel, act, *_ = states
     return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act)  # pyright: ignore[reportCallIssue]
 
 
@@ -324,7 +344,7 @@ def _growth(scene: Scene, state: State, ctrl: Array, inputs: _Inputs, gradient: 
     scene, state, ctrl, inputs = jax.tree.map(fixed, (scene, state, ctrl, inputs))
 
     def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        found = _course(scene, dataclasses.replace(state, qpos=qpos, qvel=qvel), ctrl, inputs, gradient)
+        found, _ = _course(scene, dataclasses.replace(state, qpos=qpos, qvel=qvel), ctrl, inputs, gradient)
         return found.qpos, found.qvel
 
     _, change = jax.jvp(course, (state.qpos, state.qvel), direction(state))
