@@ -23,7 +23,7 @@ ORDER = (
     ("contact", "solver"),
     ("stepping",),
     ("scene",),
-    ("native",),
+    ("engines",),
     ("rollouts",),
     ("objective",),
     ("estimators",),

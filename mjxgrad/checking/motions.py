@@ -157,7 +157,8 @@ def run(
     given = numbers, {"time": np.zeros((len(controls), 1)), **start}, {"ctrl": np.repeat(controls, refined, axis=1)}
     engine = engine_of(scene.mj_model)
     found = engine.run(*given) if follow is None else engine.follow(follow[0], *given, follow[1])
-    return found | {name: np.concatenate([start[name][:, None], found[name]], axis=1) for name in start}
+    path = {name: np.concatenate([start[name][:, None], found[name]], axis=1) for name in start}
+    return path if follow is None else path | {"change": found["change"]}
 
 
 def held(path: _States) -> tuple[_States, Int[np.ndarray, " motions"]]:
