@@ -276,13 +276,14 @@ class Inverse:
 
         for name, entry in (("ctrl", self.ctrl), ("act", self.act)):
             for k in range(len(entry)):
-                kept, ends = entry[k], []
+                own, ends = slice(k, k + 1), []
+                kept = entry[own].copy()
                 is_ctrl = name == "ctrl"
-                up, down, width = self.sides(kept, _WIDTH, k) if is_ctrl else (kept + _WIDTH, kept - _WIDTH, 2 * _WIDTH)
+                up, down, width = self.sides(kept, _WIDTH, own) if is_ctrl else (kept + _WIDTH, kept - _WIDTH, 2 * _WIDTH)
                 for value in (up, down):
-                    entry[k] = value
+                    entry[own] = value
                     ends.append(evaluated())
-                entry[k] = kept
+                entry[own] = kept
                 found[name][k] = (ends[0][0] - ends[1][0]) / width
                 if model.na:
                     found[f"next {name}"][k] = (ends[0][1] - ends[1][1]) / width

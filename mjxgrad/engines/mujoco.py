@@ -53,6 +53,7 @@ class Engine:
         levers = levers_of(mj_model)
         self.lengths = levers.max(axis=0)
         self.workers = [Worker(self.layout, levers) for _ in range(_NUM_THREADS)]
+        self.poses = np.concatenate([mj_model.key_qpos, mj_model.qpos0[None]])
         self.template = np.zeros(self.layout.size)
         mujoco.mj_getState(mj_model, self.start, self.template, EVERY)
         self.first = {name: self.template[self.places[name]] for name in MOTION}
@@ -344,7 +345,7 @@ class Engine:
     def _flat(self, ndim: int, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> tuple:
         """Return the batch's shape, one model for each of it or for all, and the arrays with one axis for the batch's."""
         values = {name: np.asarray(value) for name, value in numbers.items()}
-        given = [{k: np.asarray(v, float) for k, v in one.items()} for one in (start, inputs)]
+        given = [{k: self._exactly(k, v) for k, v in one.items()} for one in (start, inputs)]
         batch = np.broadcast_shapes(*(x.shape[:ndim] for one in (*given, values) for x in one.values()))
 
         def flat(x: np.ndarray) -> np.ndarray:
@@ -360,6 +361,18 @@ class Engine:
         if varied:
             models = [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(len(models))]
         return batch, models, *({k: flat(v) for k, v in one.items()} for one in given)
+
+    def _exactly(self, name: str, value: np.ndarray) -> np.ndarray:
+        """Return an array in double precision; positions that single precision rounded have the digits of the file again.
+
+        A body that stands on the floor in the file would else begin a nanometre above or below it.
+        """
+        given = np.asarray(value)
+        found = given.astype(float)
+        if name == "qpos" and given.dtype == np.float32:
+            for pose in self.poses:
+                np.copyto(found, pose, where=given == pose.astype(np.float32))
+        return found
 
     def _rows(self, start: _Arrays) -> Float[np.ndarray, "rows size"]:
         """Return whole states of MuJoCo, one a row, of which the start is given."""

@@ -1,6 +1,7 @@
 """The scene that `load_scene` returns, its description, and its sensors and sites by name."""
 
 import copy
+import dataclasses
 import difflib
 import textwrap
 import warnings
@@ -54,6 +55,7 @@ class Scene(eqx.Module):
         pairs: all geom pairs that can touch, in the order of `contact_parameters`; `summary` groups equal ones.
         name: source of the scene.
         unsupported: reason why MJX cannot step it, so that C MuJoCo does; empty if MJX can.
+        chosen: the engine that `with_engine` chose; empty for the default.
     """
 
     model: mjx.Model
@@ -64,11 +66,25 @@ class Scene(eqx.Module):
     pairs: Pairs = eqx.field(static=True)
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
+    chosen: Literal["", "mjx", "mujoco"] = eqx.field(static=True, default="")
 
     @property
     def engine(self) -> Literal["mjx", "mujoco"]:
-        """The default engine: "mjx", or "mujoco" where MJX lacks something."""
-        return "mujoco" if self.unsupported else "mjx"
+        """Who steps it: as chosen, else "mjx", or "mujoco" where MJX lacks something."""
+        return self.chosen or ("mujoco" if self.unsupported else "mjx")
+
+    def with_engine(self, engine: Literal["mjx", "mujoco"]) -> "Scene":
+        """Return the scene stepped by MJX, or by C MuJoCo: on all cores, without compilation, differentiable once.
+
+        Raises:
+            ValueError: if there is no such engine.
+            SceneError: if MJX cannot step the scene.
+        """
+        if engine not in ("mjx", "mujoco"):
+            raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
+        if engine == "mjx" and self.unsupported:
+            raise SceneError(self.unsupported)
+        return dataclasses.replace(self, chosen=engine)
 
     def contact_parameters(self) -> ContactParameters:
         """Return the effective parameters of the pairs that can touch, one row each; traceable."""

@@ -13,6 +13,7 @@ from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.engines.mujoco import engine_of
 from mjxgrad.stepping import own_motion
 from mjxgrad.tasks import scene_path
+from tests.engines.whole_steps import by_whole_steps
 
 # MuJoCo's own tolerance would leave more in each difference than it is to be compared to.
 _SOLVER = 'tolerance="1e-14" iterations="200"'
@@ -46,33 +47,12 @@ def _random(scene):
     return qpos, qvel, act, rng.uniform(0.05, 0.6, model.nu)
 
 
-def _by_steps(model, qpos, qvel, act, ctrl, width=1e-6):
-    """Return A and B by central differences of whole steps, each from a fresh MjData."""
-    size = 2 * model.nv + model.na
-
-    def step(change):
-        data = mujoco.MjData(model)
-        data.qpos, data.qvel, data.act = qpos, qvel + change[model.nv : 2 * model.nv], act + change[2 * model.nv : size]
-        data.ctrl = ctrl + change[size:]
-        mujoco.mj_integratePos(model, data.qpos, change[: model.nv], 1.0)
-        mujoco.mj_step(model, data)
-        return data
-
-    columns = []
-    for change in width * np.eye(size + model.nu):
-        above, below = step(change), step(-change)
-        mujoco.mj_differentiatePos(model, moved := np.zeros(model.nv), 1.0, below.qpos, above.qpos)
-        columns.append(np.concatenate([moved, above.qvel - below.qvel, above.act - below.act]) / (2 * width))
-    both = np.transpose(columns)
-    return both[:, :size], both[:, size:]
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_one_step_is_that_of_whole_steps(name):
     scene = mg.load_scene(SCENES[name], engine="mujoco")
     qpos, qvel, act, ctrl = _random(scene)
     found = mg.linearise(scene, mg.initial_state(scene, qpos, qvel, act), ctrl, contact=mg.Discrete())
-    expected = _by_steps(scene.mj_model, qpos, qvel, act, ctrl)
+    expected = by_whole_steps(scene.mj_model, qpos, qvel, act, ctrl)
     largest = max(np.abs(one).max(initial=0.0) for one in expected)
     for ours, theirs in zip((found.A, found.B), expected, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6 * largest)  # what differences of 1e-6 leave
@@ -86,7 +66,7 @@ def test_the_solve_does_not_end_early_in_derivatives():
     )
     qpos, qvel, act, ctrl = _random(fine)
     found = mg.linearise(coarse, mg.initial_state(coarse, qpos, qvel, act), ctrl, contact=mg.Discrete()).A
-    expected = _by_steps(fine.mj_model, qpos, qvel, act, ctrl)[0]
+    expected = by_whole_steps(fine.mj_model, qpos, qvel, act, ctrl)[0]
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 

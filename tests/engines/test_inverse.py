@@ -1,0 +1,97 @@
+"""Derivatives of a step from its solution, against whole steps of C MuJoCo from a fresh MjData.
+
+`mjd_transitionFD` is no truth here: it keeps the integrator's factorisation, and is off by up to a quarter in some of these.
+"""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad.engines.mujoco import Engine
+from tests.engines.whole_steps import by_whole_steps
+
+ARM = """<body pos="0 0 1"><joint name="a" axis="0 1 0" {joint}/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03" mass="1"/>
+  <site name="s0" pos=".2 0 .05"/><body pos=".4 0 0"><joint name="b" axis="0 1 0" {joint}/>
+  <geom type="capsule" fromto="0 0 0 .4 0 0" size=".03" mass=".5"/><site name="s1" pos=".2 0 .05"/></body></body>"""
+TENDON = '<tendon><spatial name="t" {tendon}><site site="s0"/><site site="s1"/></spatial></tendon>'
+# Of joints, tendons, actuators and options.
+PARTS = {
+    "polynomial damping": ('damping=".1 .3 .3"', "", "", ""),
+    "damper": ("", "", '<damper joint="a" kv="10" ctrlrange="0 1"/><motor joint="b"/>', ""),
+    "muscle": ("", " ", '<muscle tendon="t" lengthrange=".1 .6"/>', ""),
+    "gain affine in velocity": ("", "", '<general joint="a" gaintype="affine" gainprm="1 0 -3" biastype="none"/>', ""),
+    "motor with resistance": ("", "", '<dcmotor joint="a" motorconst="1 1" resistance="1"/>', ""),
+    "servo near its limit": ("", "", '<position joint="a" kp="50" kv="5" forcerange="-60 60"/>', ""),
+    "tendon's polynomial damping": ("", 'damping="1 20 20"', "", ""),
+    "actuator's polynomial damping": ("", "", '<motor joint="a" damping=".1 .5 .5"/>', ""),
+    "drag": ("", "", "", 'density="1000" viscosity=".1"'),
+}
+INTEGRATORS = ("Euler", "implicitfast", "implicit", "discrete")
+
+
+def _model(integrator, joint, tendon, actuators, options):
+    arm = ARM.format(joint=joint)
+    arm = arm.replace('mass="1"', 'mass="1" fluidshape="ellipsoid"') if options else arm
+    strings = TENDON.format(tendon=tendon.strip()) if tendon else ""
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep=".005" integrator="{integrator}" {options}/><worldbody>{arm}</worldbody>{strings}'
+        f"<actuator>{actuators}</actuator></mujoco>"
+    )
+    model.opt.tolerance = 1e-14
+    return model
+
+
+def assert_is_of_whole_steps(model, qpos, qvel, act, ctrl, **inputs):
+    """A and B are differences of whole steps to 1e-6 of the largest entry, which is what these leave."""
+    engine = Engine(model)
+    before = {"time": [[0.0]], "qpos": [qpos], "qvel": [qvel], "act": [act]}
+    before = {name: np.array([value], float) for name, value in before.items()}
+    given = {name: np.array([[value]], float) for name, value in {"ctrl": ctrl, **inputs}.items()}
+    found = engine.maps({}, before, given, engine.no_flight((1,)), gradient="discrete", wanted=("ctrl",))
+    ours = np.concatenate([found["state"][0, 0], found["ctrl"][0, 0]], axis=1)
+    expected = np.concatenate(by_whole_steps(model, qpos, qvel, act, ctrl, **inputs), axis=1)
+    np.testing.assert_allclose(ours, expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("part", PARTS)
+def test_a_step_has_the_derivative_of_whole_steps(part, integrator):
+    try:
+        model = _model(integrator, *PARTS[part])
+    except ValueError:
+        pytest.skip("this MuJoCo has no such integrator")
+    rng = np.random.default_rng(0)
+    qpos, qvel = 0.3 * rng.normal(size=model.nq), 3 * rng.normal(size=model.nv)
+    assert_is_of_whole_steps(model, qpos, qvel, 0.5 * np.ones(model.na), 0.5 * np.ones(model.nu))
+
+
+BOX = """<mujoco><option cone="{cone}" integrator="{integrator}" tolerance="1e-14" iterations="200"/><worldbody>
+  <geom type="plane" size="2 2 .1"/><body pos="0 0 .098" euler="1 2 3"><freejoint/><geom type="box" size=".1 .15 .1" mass="1"/>
+  <body pos="0 0 .1"><joint name="j" type="ball" range="0 20" limited="true" damping=".1" frictionloss=".02"/>
+  <geom type="capsule" fromto="0 0 0 .1 0 .2" size=".02"/></body></body></worldbody>
+  <actuator><motor joint="j" gear="1 2 3"/><general joint="j" gear="0 1 0" dyntype="filter" dynprm=".05" gainprm="3"/></actuator>
+  </mujoco>"""
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_a_pulled_body_in_contact_beyond_its_limit_has_it_too(cone, integrator):
+    """A turned box on the floor, with an arm beyond a ball joint's limit, under a force on its body, which its turn carries along."""
+    model = mujoco.MjModel.from_xml_string(BOX.format(cone=cone, integrator=integrator))
+    rng, qpos = np.random.default_rng(1), model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, np.concatenate([0.01 * rng.normal(size=6), [0.5, 0.1, 0.2]]), 1.0)
+    pull = rng.normal(size=(model.nbody, 6))
+    assert_is_of_whole_steps(model, qpos, rng.normal(size=9), np.array([0.3]), np.array([0.2, -0.1]), xfrc_applied=pull)
+
+
+def test_a_control_at_its_limit_has_the_derivative_of_its_inside():
+    """`mjd_transitionFD` has the same rule; a control beyond the limit does nothing."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="j"/><geom size=".1" pos=".1 0 0"/></body></worldbody><actuator>
+        <motor joint="j" ctrlrange="-1 1"/><motor joint="j" ctrlrange="-1 1"/><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>"""
+    )
+    engine, before = Engine(model), {"time": [[[0.0]]], "qpos": [[[0.0]]], "qvel": [[[0.0]]]}
+    found = engine.maps({}, before, {"ctrl": np.array([[[1.0, 0.0, 1.1]]])}, engine.no_flight((1,)), gradient="discrete", wanted=("ctrl",))
+    at_limit, inside, beyond = found["ctrl"][0, 0, 1]
+    np.testing.assert_allclose(at_limit, inside, rtol=1e-6)
+    assert inside > 0 and beyond == 0.0
