@@ -10,8 +10,8 @@ and no difference contains an iteration of a solver: nothing that its tolerance 
 need no kinematics and no collisions.
 
 - **Width.** R is as exact as rounding, so positions move by 2⁻³⁰ (m or rad) to one side: centred differences of 1e-6 are as far off
-  (1e-6 of the largest entry on legged robots), and meet a thousand times as many surfaces. Without constraints they move by 2⁻²⁶.
-  Shapes whose contacts are found by iterations, to 1e-6, are moved by 1e-6 to both sides.
+  (1e-6 of the largest entry on legged robots), and meet a thousand times as many surfaces. Without constraints they move by 2⁻²²
+  to both sides. Shapes whose contacts are found by iterations, to 1e-6, are moved by 1e-6 to both sides.
 - **Actuators.** Each force depends on the actuator's own length, velocity, control and activations, so all are changed at once,
   and the moment arms carry the result. Where the integrator's matrix depends on controls (muscles, gains by velocity), where
   joints or tendons limit forces, or actuators are coupled, each is changed alone, and R is taken anew.
@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from mjxgrad.engines.layout import EVERY, Layout
 
-_NARROW, _FREE = 2.0**-30, 2.0**-26  # m or rad, with and without constraints; powers of two change a number by just that
+_NARROW, _FREE = 2.0**-30, 2.0**-22  # m or rad, with and without constraints; powers of two change a number by just that
 _WIDTH = 1e-6  # of all but positions; of parameters as a share of their value
 _PUSH = 1e-5  # m/s² or rad/s², by which R is nearly linear: forces have kinks where friction reaches its cone
 _RESIDUAL = 1e-6  # of the largest force, above which a step has no R that is zero
@@ -154,11 +154,12 @@ class Inverse:
                     touching[geoms if owners is None else owners[geoms]] = 1
             for one, before, touching in zip(self.filters, self.filtered, 2 * self.touching, strict=True):
                 np.multiply(before, touching, out=one)
-        if geoms is None or not self._is_iterative(geoms):
-            mujoco.mjd_inverseFD(model, data, _NARROW if data.nefc else _FREE, True, found, *[None] * 6)
+        if data.nefc and not (geoms is not None and self._is_iterative(geoms)):
+            mujoco.mjd_inverseFD(model, data, _NARROW, True, found, *[None] * 6)
         else:
-            mujoco.mjd_inverseFD(model, data, _WIDTH, True, found, *[None] * 6)
-            mujoco.mjd_inverseFD(model, data, -_WIDTH, True, other := np.empty_like(found), *[None] * 6)
+            width = _WIDTH if data.nefc else _FREE
+            mujoco.mjd_inverseFD(model, data, width, True, found, *[None] * 6)
+            mujoco.mjd_inverseFD(model, data, -width, True, other := np.empty_like(found), *[None] * 6)
             found += other
             found *= 0.5
         for one, before in zip(self.filters, self.filtered, strict=True):

@@ -1,0 +1,183 @@
+"""One motion has one derivative: by an array of controls, a policy, a rollout that goes on, and an environment's steps."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.engines import engine_of
+from mjxgrad.envs import Environment
+
+# Both of its ends land and leave the floor again, so that pairs of motions are in flight most of the time.
+LINKS = """<mujoco><option timestep=".002"/><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .32" euler="0 25 0">
+  <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 .25 0 0" size=".03" mass=".5"/>
+  <body pos=".25 0 0"><joint name="k" axis="0 1 0" damping=".02" stiffness=".5"/>
+  <geom type="capsule" fromto="0 0 0 .25 0 0" size=".03" mass=".5"/></body></body></worldbody>
+  <actuator><motor joint="k" ctrlrange="-1 1"/></actuator></mujoco>"""
+HORIZON, SKIP = 120, 4
+HEIGHTS = jnp.array([0.0, 0.007, 0.013])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return mg.load_scene(LINKS).with_engine("mujoco")
+
+
+def _start(scene, height):
+    return mg.initial_state(scene, scene.data.qpos.at[1].add(height), jnp.array([0.5, 0.0, 0.0, 0.0]))
+
+
+def _derivative(course):
+    """Return derivatives by height, of positions and velocities after each interval."""
+    return np.asarray(jax.jit(jax.vmap(jax.jacfwd(course)))(HEIGHTS))
+
+
+@pytest.fixture(scope="module")
+def by_array(scene):
+    def course(height):
+        found = mg.rollout(scene, _start(scene, height), jnp.zeros((HORIZON, 1)), contact=mg.Slope())
+        return jnp.concatenate([found.qpos, found.qvel], axis=1)[SKIP::SKIP]
+
+    return _derivative(course)
+
+
+def assert_alike(found, by_array):
+    np.testing.assert_allclose(found, by_array, atol=1e-6 * np.abs(by_array).max())
+
+
+def test_pairs_are_in_flight_between_intervals(scene, by_array):
+    """Else the tests below would compare nothing."""
+
+    def held(height):
+        state, found = _start(scene, height), []
+        for _ in range(HORIZON // SKIP):
+            state = mg.rollout(scene, state, jnp.zeros((SKIP, 1)), contact=mg.Slope()).final
+            found.append(state.pairs.held)
+        return jnp.stack(found)
+
+    assert np.abs(_derivative(held)).max() > 0.1
+    assert np.abs(by_array).max() > 1
+
+
+def test_a_policy_that_gives_the_same_controls_has_the_derivative_of_the_array(scene, by_array):
+    def course(height):
+        policy = lambda gain, state: gain * jnp.zeros(1)  # noqa: E731
+        found = mg.rollout(scene, _start(scene, height), policy, jnp.ones(()), horizon=HORIZON, contact=mg.Slope())
+        return jnp.concatenate([found.qpos, found.qvel], axis=1)[SKIP::SKIP]
+
+    assert_alike(_derivative(course), by_array)
+
+
+def test_a_rollout_that_goes_on_has_the_derivative_of_one(scene, by_array):
+    def course(height):
+        state, ends = _start(scene, height), []
+        for _ in range(HORIZON // SKIP):
+            state = mg.rollout(scene, state, jnp.zeros((SKIP, 1)), contact=mg.Slope()).final
+            ends.append(jnp.concatenate([state.qpos, state.qvel]))
+        return jnp.stack(ends)
+
+    assert_alike(_derivative(course), by_array)
+
+
+class Links(Environment):
+    def observe(self, state, memory):
+        return jnp.concatenate([state.qpos, state.qvel])
+
+    def rewards(self, before, action, after, memory):
+        return {"forward": after.qpos[0]}
+
+
+def test_the_steps_of_an_environment_have_it_too(scene, by_array):
+    environment = Links(scene=scene, contact=mg.Slope(), frame_skip=SKIP)
+
+    def course(height):
+        first = dataclasses.replace(environment.reset(jax.random.key(0)), physics=_start(scene, height))
+
+        def step(state, _):
+            state = environment.step(state, jnp.zeros(1))
+            return state, state.obs
+
+        return jax.lax.scan(step, first, None, length=HORIZON // SKIP)[1]
+
+    assert_alike(_derivative(course), by_array)
+
+
+def test_reverse_mode_through_a_policy_is_forward_mode(scene):
+    """By a gain, which moves the landings."""
+
+    def end(gain):
+        policy = lambda gain, state: gain * (0.3 - state.qpos[3:])  # noqa: E731
+        found = mg.rollout(scene, _start(scene, 0.0), policy, gain, horizon=HORIZON, contact=mg.Slope())
+        return found.qpos[-1]
+
+    forward, reverse = jax.jit(jax.jacfwd(end))(0.2), jax.jit(jax.jacrev(end))(0.2)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-9 * np.abs(forward).max())
+
+
+def test_the_change_that_checks_follow_is_that_of_a_rollout(scene, by_array):
+    model, num = scene.mj_model, len(HEIGHTS)
+    qpos = np.tile(model.qpos0, (num, 1))
+    qpos[:, 1] += HEIGHTS
+    start = {"time": np.zeros((num, 1)), "qpos": qpos, "qvel": np.tile([0.5, 0.0, 0.0, 0.0], (num, 1))}
+    changes = (np.tile(np.eye(8)[1], (num, 1)), np.zeros((num, HORIZON, 1)))
+    found = engine_of(model).follow("slope", {}, start, {"ctrl": np.zeros((num, HORIZON, 1))}, changes)
+    assert_alike(found["change"][:, SKIP - 1 :: SKIP], by_array)
+
+
+def test_a_scene_is_stepped_by_the_engine_that_was_chosen(scene):
+    assert (scene.engine, mg.load_scene(LINKS).engine) == ("mujoco", "mjx")
+    assert scene.with_engine("mjx").engine == "mjx"
+    flexible = mg.load_scene(LINKS, engine="mujoco")
+    with pytest.raises(ValueError, match="was loaded for C MuJoCo"):
+        flexible.with_engine("mjx")
+
+
+DELAYED = """<mujoco><option timestep=".01" integrator="{}"/><worldbody><body><joint name="j" axis="0 1 0" damping=".1"/>
+  <geom size=".05" pos="0 0 -.5"/></body></worldbody><actuator><motor joint="j" delay=".05" nsample="6"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize("way", ["array", "policy", "goes on"])
+def test_a_delayed_actuator_keeps_its_history(way, integrator):
+    """Its controls act five steps later, also after an interruption; derivatives are differences of C MuJoCo's motion."""
+    model = mujoco.MjModel.from_xml_string(DELAYED.format(integrator))
+    scene, controls = mg.load_scene(model), np.linspace(0.5, 1, 40)[:, None]
+
+    def by_mujoco(added):
+        data = mujoco.MjData(model)
+        for ctrl in controls + added:
+            data.ctrl = ctrl
+            mujoco.mj_step(model, data)
+        return data.qpos[0]
+
+    def end(added):
+        start = mg.initial_state(scene)
+        if way == "policy":
+            policy = lambda added, state: added + 0.5 + 0.5 * state.time.reshape(1) / 0.39  # noqa: E731
+            return mg.rollout(scene, start, policy, added, horizon=40, contact=mg.Discrete("mujoco")).qpos[-1, 0]
+        if way == "goes on":
+            half = mg.rollout(scene, start, controls[:20] + added, contact=mg.Discrete("mujoco"))
+            return mg.rollout(scene, half.final, controls[20:] + added, contact=mg.Discrete("mujoco")).qpos[-1, 0]
+        return mg.rollout(scene, start, controls + added, contact=mg.Discrete("mujoco")).qpos[-1, 0]
+
+    value, derivative = jax.value_and_grad(end)(0.0)
+    np.testing.assert_allclose(value, by_mujoco(0.0), rtol=1e-9)
+    np.testing.assert_allclose(derivative, (by_mujoco(1e-6) - by_mujoco(-1e-6)) / 2e-6, rtol=1e-6)
+
+
+def test_a_start_on_the_floor_is_that_of_the_file_in_single_precision():
+    """A box of 0.04 m stands at 0.04 m: rounded, it would begin a nanometre inside the floor, which contact of 1e5 1/s² shows."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .04"><freejoint/>
+        <geom type="box" size=".04 .04 .04"/></body></worldbody></mujoco>"""
+    )
+    engine, rounded = engine_of(model), model.qpos0.astype(np.float32)
+    assert (rounded != model.qpos0).any()
+    np.testing.assert_array_equal(engine._exactly("qpos", rounded), model.qpos0)
+    moved = rounded + np.float32(1e-3)
+    np.testing.assert_array_equal(engine._exactly("qpos", moved)[2], float(moved[2]))
