@@ -17,7 +17,7 @@ an event costs four more steps, and a step without any costs nothing.
 - **Followed.** f(q⁺) has not been pushed yet, and what follows is not linear between two states so far apart: friction ends,
   a short contact lets go, one that chatters comes back. So both go on, step by step, until A₀ explains how they differ. Changes
   then go two ways, x' = A₀ (1 - P L) x + D_k x₋, with D_k the difference after k steps and x₋ what the event felt before them.
-  Until then D_j x₋ is the outcome's alone. See `native.pairs`. Without, derivatives of gymnasium's hopper scatter ten to thirty
+  Until then D_j x₋ is the outcome's alone. See `engines.flight`. Without, derivatives of gymnasium's hopper scatter ten to thirty
   times as far, and chatter multiplies them at each event: those of a ball that a box pushes scatter by 93, not 0.26.
 
 - **Together.** The corners of a box that lands flat cross their surface in one step, and what each does depends on the others.
@@ -30,7 +30,8 @@ an event costs four more steps, and a step without any costs nothing.
 - **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
   impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply. These move by about as much as
   a step of free acceleration a, less what damping keeps of it, h² |J a|. ε is no larger, since a window that is wider than the
-  travel of what lands or creeps slowly biases it.
+  travel of what lands or creeps slowly biases it; and it is at most four steps of travel, since a contact that rests a few
+  micrometres deep crosses nothing. Taken for events, resting corners of a box that an arm pushes took most of its gradient's time.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
 - **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.
@@ -38,10 +39,9 @@ an event costs four more steps, and a step without any costs nothing.
   Small differences see that, and multiplied motions by 1e30 in fifty steps.
 - **Undecided.** A gap that no coordinate moves and that is zero to rounding (a robot that slides in a plane on the floor) opens
   and closes at random. Differences are then taken with margins by which it stays as it was in the step itself.
-- **Small differences** are of one side. Where a gap is smaller than they are, they are taken a little farther off, also for
-  "discrete" gradients. Contacts that chatter have such gaps at one step in a hundred. `mjd_transitionFD` crosses the surface
-  there, and has entries of 1e5 in place of 1e2. Where they are steeper than any contact, they step over another jump, as of a
-  stage of Runge-Kutta that meets a surface; then narrower ones are taken.
+- **Small differences** are those of `engines.inverse`. Where a gap is smaller than they are, they are taken a little farther off,
+  also for "discrete" gradients. Where they are steeper than any contact, they step over another jump, as of a stage of
+  Runge-Kutta that meets a surface; then those of whole steps are taken, and narrower ones.
 - **Sizes and places.** What moves a gap at a rate R (a radius, a mocap body's place, a joint's range) moves the crossing as
   displacements P R do, and has D R. Its small differences are taken at the same gap, that is with -P R added to the position.
 - **Reach.** Velocities, activations and controls do not move gaps within the step: small differences serve them.
@@ -217,7 +217,9 @@ class Surfaces:
             times = -np.where(is_met, gaps, 0.0) / np.where(is_met, rate, 1.0)
             events = _by_modes(rows, gaps, centres, widths, times, chosen, is_contact, self.lengths)
         others = jumps & ~chosen & np.isfinite(gaps)  # a force that begins without a jump may be crossed
-        return Near(events, self._movers(data, is_rough), bool(is_undecided.any()), rows[others], gaps[others], self.lengths)
+        return Near(
+            events, self._movers(data, is_rough), bool(is_undecided.any()), rows[others], gaps[others], self.lengths
+        )
 
     def _movers(self, data: mujoco.MjData, is_rough: _Mask) -> Int[np.ndarray, " some"]:
         """Return the velocities that move one body of a chosen contact and not the other."""

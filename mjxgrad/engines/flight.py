@@ -1,18 +1,18 @@
 r"""Two motions from either side of an event, followed while the derivative along the motion does not say how they differ.
 
-A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
-steps both have been, and differ little. Between, the outcome's change is D_j h, with D_j the difference of the two motions after j
-steps over their distance before, and h the share of that distance by which a change moves the event. Changes go two ways:
+A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After
+a few steps both have been, and differ little. Between, the outcome's change is D_j h, with D_j the difference of the two motions
+after j steps over their distance before, and h the share of that distance by which a change moves the event. Changes go two ways:
 
     x' = A x + b,        h' = keep (h + slots (F x + f)),        whole change = x' + D h'.
 
 A is the derivative along the motion without events, F what each event that begins feels. A pair that is let go joins x.
 
-- **Explained.** A pair is explained after three steps in a row in which D' is A D to a twentieth. An event between the two adds its
-  jump to A D, if they lie to either side of it; if they do not, it adds what a small difference does. Either explains.
-- **Let go.** It is let go once explained, and if it is at most ten times as far apart as at first; or, where an event is met, if it
-  is less far apart than the event's own window: that event then has a better mean of its phases than two motions have. Motions that
-  are farther apart span many phases of the next event, and a derivative would multiply there. After a hundred steps it is let go.
+- **Explained.** A pair is explained after three steps in a row in which D' is A D to a twentieth. An event between the two adds
+  its jump to A D, if they lie to either side of it; if they do not, it adds what a small difference does. Either explains.
+- **Let go.** Once explained, it is let go if it is at most ten times as far apart as at first; or, at an event, if it is less far
+  apart than the event's own window. That event then has a better mean of its phases than two motions have. Motions that are
+  farther apart span many phases of the next event, where a derivative multiplies. After a hundred steps all are let go.
 - **Slots.** A motion has room for a number of pairs; where it lacks, the pair that is least apart is let go.
 
 A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
@@ -87,7 +87,9 @@ class Flight:
             apart[motions, slots] = layout.difference(both[:, 0], both[:, 1]) / widths[live][:, None]
         return cls(ends, widths.copy(), left.astype(int), alike.astype(int), apart)
 
-    def packed(self, layout: Layout, rows: Float[np.ndarray, "motions size"]) -> Float[np.ndarray, "motions slots numbers"]:
+    def packed(
+        self, layout: Layout, rows: Float[np.ndarray, "motions size"]
+    ) -> Float[np.ndarray, "motions slots numbers"]:
         """Return all in one array, with both ends as changes of whole states, which single precision does not round away."""
         size = layout.num_changes
         found = np.zeros((*self.widths.shape, 2 * size + 3))
@@ -95,7 +97,9 @@ class Flight:
             motions, slots = np.nonzero(live)
             both = np.repeat(rows[motions][:, None], 2, axis=1)
             both[..., layout.motion] = self.ends[motions, slots]
-            found[motions, slots, : 2 * size] = layout.difference(both, rows[motions][:, None]).reshape(len(motions), -1)
+            found[motions, slots, : 2 * size] = layout.difference(both, rows[motions][:, None]).reshape(
+                len(motions), -1
+            )
             found[motions, slots, 2 * size :] = np.stack([self.widths, self.left, self.alike], axis=-1)[live]
         return found
 
@@ -132,7 +136,7 @@ def fly(
         found: "felt", "slot", "apart" and "stays" with axes of motions and steps; "before" and "enters", without steps.
     """
     scale = np.concatenate([lengths, _STEPS * timestep * lengths, np.zeros(layout.num_rest)])
-    num, steps = course.rows.shape[:2]
+    steps = course.rows.shape[1]
     by_step: dict[int, list[int]] = {}
     for motion, t in course.begun:
         by_step.setdefault(t, []).append(motion)

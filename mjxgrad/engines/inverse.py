@@ -9,16 +9,16 @@ and no difference contains an iteration of a solver: nothing that its tolerance 
 `mjENBL_INVDISCRETE` is R for all integrators but Runge-Kutta. Differences by velocities, accelerations, activations and controls
 need no kinematics and no collisions.
 
-- **Width.** R is as exact as rounding, so positions move by 2⁻³⁰ (m or rad) to one side: centred differences of 1e-6 are as far off
-  (1e-6 of the largest entry on legged robots), and meet a thousand times as many surfaces. Without constraints they move by 2⁻²²
-  to both sides. Shapes whose contacts are found by iterations, to 1e-6, are moved by 1e-6 to both sides.
+- **Width.** R is as exact as rounding, so positions move by 2⁻³⁰ (m or rad) to one side. Centred differences of 1e-6 are as far
+  off (1e-6 of the largest entry on legged robots), and meet a thousand times as many surfaces. Without constraints they move by
+  2⁻²² to both sides. Shapes whose contacts are found by iterations, to 1e-6, are moved by 1e-6 to both sides.
 - **Actuators.** Each force depends on the actuator's own length, velocity, control and activations, so all are changed at once,
   and the moment arms carry the result. Where the integrator's matrix depends on controls (muscles, gains by velocity), where
   joints or tendons limit forces, or actuators are coupled, each is changed alone, and R is taken anew.
 - **What has no R**: Runge-Kutta, noslip, delays, plugins, and steps whose residual is not zero. See `engines.differences`.
 
-`mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by up to a
-quarter there.
+`mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by
+up to a quarter there.
 
 References:
     Todorov. Convex and analytically-invertible dynamics with contacts and constraints. ICRA 2014.
@@ -30,14 +30,20 @@ from jaxtyping import Float
 
 from mjxgrad.engines.layout import EVERY, Layout
 
-_NARROW, _FREE = 2.0**-30, 2.0**-22  # m or rad, with and without constraints; powers of two change a number by just that
-_WIDTH = 1e-6  # of all but positions; of parameters as a share of their value
+_NARROW, _FREE = (
+    2.0**-30,
+    2.0**-22,
+)  # m or rad, with and without constraints; powers of two change a number by just that
+_SPEED = 2.0**-24  # m/s or rad/s
+_WIDTH = 1e-6  # of activations and controls
 _PUSH = 1e-5  # m/s² or rad/s², by which R is nearly linear: forces have kinks where friction reaches its cone
 _RESIDUAL = 1e-6  # of the largest force, above which a step has no R that is zero
 _TINY = 1e-30
 _VELOCITY = mujoco.mjtStage.mjSTAGE_POS.value  # the stage that is done: velocities are next
 # Shapes whose contacts with all but planes are found by iterations.
-_ITERATED = tuple(getattr(mujoco.mjtGeom, f"mjGEOM_{name}").value for name in ("HFIELD", "ELLIPSOID", "CYLINDER", "MESH", "SDF"))
+_ITERATED = tuple(
+    getattr(mujoco.mjtGeom, f"mjGEOM_{name}").value for name in ("HFIELD", "ELLIPSOID", "CYLINDER", "MESH", "SDF")
+)
 _OWN_GAINS = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
 # Those whose matrix has the derivatives of forces by velocity; the last is known to later releases alone.
 _IMPLICIT = tuple(
@@ -64,7 +70,9 @@ class Inverse:
         model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_INVDISCRETE
         data, self.moment = self.data, np.zeros((model.nu, model.nv))
         self.qpos, self.qvel, self.qacc, self.act, self.ctrl = data.qpos, data.qvel, data.qacc, data.act, data.ctrl
-        self.low, self.high = np.where(np.asarray(model.actuator_ctrllimited, bool)[:, None], model.actuator_ctrlrange, [[-np.inf, np.inf]]).T
+        self.low, self.high = np.where(
+            np.asarray(model.actuator_ctrllimited, bool)[:, None], model.actuator_ctrlrange, [[-np.inf, np.inf]]
+        ).T
         depends = model.actuator_gaintype != mujoco.mjtGain.mjGAIN_FIXED
         is_coupled = bool(
             (~np.isin(model.actuator_gaintype, _OWN_GAINS)).any()
@@ -123,14 +131,18 @@ class Inverse:
         """
         model, data = self.model, self.data
         self._set(row, acceleration)
-        nothing = [None] * 6
         self._by_position(found["qpos"])
-        mujoco.mjd_inverseFD(model, data, _WIDTH, True, None, found["qvel"], *nothing[:5])
-        mujoco.mjd_inverseFD(model, data, _PUSH, True, None, None, found["qacc"], *nothing[:4])
-        if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and data.ncon:
-            mujoco.mjd_inverseFD(model, data, -_PUSH, True, None, None, other := np.empty_like(found["qacc"]), *nothing[:4])
-            found["qacc"] += other
-            found["qacc"] *= 0.5
+        # Friction by elliptic cones is curved: there both sides are needed.
+        is_curved = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and data.ncon
+        for name, width, before in (("qvel", _SPEED, 1), ("qacc", _PUSH, 2)):
+            arguments: list[np.ndarray | None] = [None] * 7
+            arguments[before] = found[name]
+            mujoco.mjd_inverseFD(model, data, width, True, *arguments)
+            if is_curved:
+                arguments[before] = other = np.empty_like(found[name])
+                mujoco.mjd_inverseFD(model, data, -width, True, *arguments)
+                found[name] += other
+                found[name] *= 0.5
         # The last difference moved accelerations alone.
         self.qacc[:] = acceleration
         at = self.residual(_VELOCITY)
@@ -167,7 +179,9 @@ class Inverse:
 
     def _is_iterative(self, geoms: np.ndarray) -> bool:
         """Return whether some pair of geoms has a contact that is found by iterations."""
-        return self.has_iterated and bool((self.is_iterated[geoms].any(axis=1) & ~self.is_plane[geoms].any(axis=1)).any())
+        return self.has_iterated and bool(
+            (self.is_iterated[geoms].any(axis=1) & ~self.is_plane[geoms].any(axis=1)).any()
+        )
 
     def _by_applied(self, found: np.ndarray) -> None:
         """Take what positions change of forces that are applied to bodies."""
@@ -193,7 +207,9 @@ class Inverse:
         self.qpos[:], self.qvel[:], self.act[:] = kept
         return end
 
-    def sides(self, ctrl: np.ndarray, width: float, index: np.ndarray | int | slice = slice(None)) -> tuple[np.ndarray, ...]:
+    def sides(
+        self, ctrl: np.ndarray, width: float, index: np.ndarray | int | slice = slice(None)
+    ) -> tuple[np.ndarray, ...]:
         """Return controls moved up and down, those within their limits no farther, and the distances between."""
         low, high, up, down = self.low[index], self.high[index], ctrl + width, ctrl - width
         is_inside = (ctrl >= low) & (ctrl <= high)
@@ -213,7 +229,7 @@ class Inverse:
 
         Two steps: the first follows the geometry, the second takes what forces then have beyond their linear change.
         """
-        model, data, found = self.model, self.data, []
+        found = []
         inverse = np.linalg.inv(matrix.T)
         self._set(row, acceleration)
         for place in places:
@@ -225,9 +241,13 @@ class Inverse:
 
     def _all_at_once(self, found: dict[str, np.ndarray]) -> None:
         model, data = self.model, self.data
-        mujoco.mju_sparse2dense(self.moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+        mujoco.mju_sparse2dense(
+            self.moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        )
 
-        def changes(entry: np.ndarray, index: np.ndarray, *, is_ctrl: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+        def changes(
+            entry: np.ndarray, index: np.ndarray, *, is_ctrl: bool = False
+        ) -> tuple[np.ndarray, np.ndarray | None]:
             """Return the derivatives of forces and of next activations, each by its own actuator's entry."""
             kept, ends = entry[index].copy(), []
             if is_ctrl:
@@ -246,12 +266,14 @@ class Inverse:
                 return by_force, None
             per_act = np.zeros(model.nu)
             per_act[owner] = width
-            return by_force, (ends[0][1] - ends[1][1]) / np.maximum(per_act[self.of_act], 1e-30) * (per_act[self.of_act] > 0)
+            return by_force, (ends[0][1] - ends[1][1]) / np.maximum(per_act[self.of_act], 1e-30) * (
+                per_act[self.of_act] > 0
+            )
 
         every = np.arange(model.nu)
         by_force, of_next = changes(self.ctrl, every, is_ctrl=True)
         found["ctrl"][:] = -by_force[:, None] * self.moment
-        if not model.na:
+        if of_next is None:
             return
         acts = np.arange(model.na)
         found["next ctrl"][:] = 0.0
@@ -260,16 +282,18 @@ class Inverse:
         for number in range(self.order.max() + 1):
             chosen = np.flatnonzero(self.order == number)
             by_force, of_next = changes(self.act, chosen)
+            assert of_next is not None
             found["act"][chosen] = -by_force[self.of_act[chosen], None] * self.moment[self.of_act[chosen]]
             for one in chosen:
                 own = np.flatnonzero(self.of_act == self.of_act[one])
                 found["next act"][one, own] = of_next[own]
         for name, entry in (("qpos", data.actuator_length), ("qvel", data.actuator_velocity)):
             _, of_next = changes(entry, every)
+            assert of_next is not None
             found[f"next {name}"][:] = (of_next[:, None] * self.moment[self.of_act]).T
 
     def _one_by_one(self, found: dict[str, np.ndarray]) -> None:
-        model, data = self.model, self.data
+        model = self.model
 
         def evaluated() -> tuple[np.ndarray, np.ndarray]:
             force = self.residual(_VELOCITY)
@@ -280,7 +304,9 @@ class Inverse:
                 own, ends = slice(k, k + 1), []
                 kept = entry[own].copy()
                 is_ctrl = name == "ctrl"
-                up, down, width = self.sides(kept, _WIDTH, own) if is_ctrl else (kept + _WIDTH, kept - _WIDTH, 2 * _WIDTH)
+                up, down, width = (
+                    self.sides(kept, _WIDTH, own) if is_ctrl else (kept + _WIDTH, kept - _WIDTH, 2 * _WIDTH)
+                )
                 for value in (up, down):
                     entry[own] = value
                     ends.append(evaluated())
@@ -318,7 +344,11 @@ def shapes(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
 
 
 def step_of(
-    layout: Layout, timestep: float, speeds: Float[np.ndarray, "rows nv"], found: dict[str, np.ndarray], names: list[str]
+    layout: Layout,
+    timestep: float,
+    speeds: Float[np.ndarray, "rows nv"],
+    found: dict[str, np.ndarray],
+    names: list[str],
 ) -> dict[str, np.ndarray]:
     """Return the derivatives of steps by "state" and by what else is named, from those of R, inputs first.
 

@@ -22,7 +22,7 @@ from mjxgrad.engines.layout import EVERY, INPUTS, Layout
 from mjxgrad.engines.stepmap import FIRST, PAIRS
 from mjxgrad.stepping import Gradient
 
-_WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's own documentation has it; of parameters as a share of their value
+_WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
 # How the names of model arrays and inputs end that move surfaces.
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
@@ -139,7 +139,7 @@ class Worker:
                 done.append((k, i, one))
         explicit = [(k, one) for k, _, one in done if one.is_explicit]
         self._assemble(raw, explicit, names)
-        for k, i, one in done:
+        for _, i, one in done:
             if one.is_explicit and self._is_steep(one):
                 self._beside(steps.gradient, one, names)
             self._with_events(one, names)
@@ -187,7 +187,7 @@ class Worker:
 
     def _look(self, one: _Row) -> None:
         """Find the events near a state, and the motions from either side of them."""
-        speed, places = self.layout.places["qvel"], self.layout.places
+        speed = self.layout.places["qvel"]
         mujoco.mj_setState(self.surfaces.model, self.far, one.before, EVERY)
         near = self.surfaces.near(self.far, one.before[speed], one.after[speed], self.inverse.data.qacc_smooth)
         if near is None:
@@ -282,7 +282,7 @@ class Worker:
         if one.near is None:
             return
         rest = np.eye(nv)
-        if events is not None:
+        if events is not None and one.begun is not None:
             rest -= events.moves @ events.rows
             lost = matrix[:, :nv] @ events.moves
             matrix[:, nv : 2 * nv] -= lost @ events.ahead
@@ -293,12 +293,13 @@ class Worker:
             matrix[:, :nv] = by_rest
         elif events is not None:
             matrix[:, :nv] = matrix[:, :nv] @ rest
-        if events is not None and "apart" not in one.found:  # nobody follows them
+        if one.begun is not None and "apart" not in one.found:  # nobody follows them
             matrix += one.begun.apart.T @ one.begun.felt
 
     def _visibly(self, one: _Row, rest: Float[np.ndarray, "nv nv"], found: Float[np.ndarray, "size nv"]) -> None:
         """Write derivatives along displacements by as much as moves surfaces visibly, where they move a rough contact."""
         layout, near, places = self.layout, one.near, self.layout.places
+        assert near is not None
         sizes = np.abs(rest).max(axis=0)
         found[:, sizes < _NOTHING] = 0.0  # what an event leaves of a coordinate that moves it alone
         moving = np.flatnonzero((sizes >= _NOTHING) & (np.abs(rest[near.rough]).max(axis=0, initial=0.0) >= _NOTHING))
@@ -312,7 +313,9 @@ class Worker:
             ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
             found[:, moving] = (layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]).T
             return
-        ends = one.by.solutions(one.clear, one.acceleration, one.raw["qacc"], starts[..., places["qpos"]].reshape(-1, self.model.nq))
+        ends = one.by.solutions(
+            one.clear, one.acceleration, one.raw["qacc"], starts[..., places["qpos"]].reshape(-1, self.model.nq)
+        )
         ends = ends.reshape(len(moving), 2, layout.nv)
         timestep = self.model.opt.timestep
         change = timestep * ((ends[:, 0] - ends[:, 1]) / (2 * widths)[:, None]).T
@@ -394,7 +397,10 @@ class Worker:
         """Write small differences of sensors by state, controls, other inputs and numbers."""
         model, data, place = self.inverse.model, self.inverse.data, self.layout.places["ctrl"]
         by_state, by_control = found["state"], found.get("ctrl", np.zeros((model.nsensordata, model.nu)))
-        if self.layout.num_changes == 2 * model.nv + model.na and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        if (
+            self.layout.num_changes == 2 * model.nv + model.na
+            and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+        ):
             mujoco.mj_setState(model, data, row, EVERY)
             mujoco.mjd_transitionFD(model, data, _WIDTH, True, None, None, by_state, by_control)
         else:
@@ -422,7 +428,9 @@ class Worker:
                     shift = -events.moves @ shares[:, column]
                 by_solution = one.is_explicit and name != _OF_TIME
 
-                def end(amount: float, put: Callable = put, shift: np.ndarray = shift, by_solution: bool = by_solution) -> np.ndarray:
+                def end(
+                    amount: float, put: Callable = put, shift: np.ndarray = shift, by_solution: bool = by_solution
+                ) -> np.ndarray:
                     start = self.layout.moved(put(amount), amount * shift)
                     if by_solution:
                         return np.concatenate(one.by.at(start, one.acceleration))
@@ -438,7 +446,9 @@ class Worker:
             if one.begun is not None and events is not None:
                 one.begun.by_others[name] = shares
 
-    def _changes(self, by: Inverse, row: np.ndarray, name: str) -> Iterator[tuple[Callable[[float], np.ndarray], float, bool]]:
+    def _changes(
+        self, by: Inverse, row: np.ndarray, name: str
+    ) -> Iterator[tuple[Callable[[float], np.ndarray], float, bool]]:
         """Give for each entry a function of an amount to the state that it changes so, a small amount, and whether it is zero.
 
         Numbers of the model change here and where gaps are measured.

@@ -44,7 +44,9 @@ class Layout:
         self.rest = np.concatenate([whole[self.places[name]] for name in MOTION[2:]])
         self.motion = np.concatenate([whole[self.places[name]] for name in MOTION])
         kinds = list(zip(model.jnt_type.tolist(), model.jnt_qposadr.tolist(), model.jnt_dofadr.tolist(), strict=True))
-        turning = [(qpos + _QUATERNIONS[kind], dof + _QUATERNIONS[kind]) for kind, qpos, dof in kinds if kind in _QUATERNIONS]
+        turning = [
+            (qpos + _QUATERNIONS[kind], dof + _QUATERNIONS[kind]) for kind, qpos, dof in kinds if kind in _QUATERNIONS
+        ]
         self.quaternions = np.array([qpos for qpos, _ in turning], int)[:, None] + np.arange(4)
         self.turns = np.array([dof for _, dof in turning], int)[:, None] + np.arange(3)
         is_plain = np.ones(model.nv, bool)

@@ -61,8 +61,8 @@ class Engine:
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
         """Return positions, velocities, activations and what else goes on, after each step.
 
-        With a warm start, "warmstart" is that of the next step after a single one, so that steps one by one are the same motion to
-        the last bit; after several it is zero.
+        With a warm start, "warmstart" is that of the next step after a single one, so that steps one by one are the same motion
+        to the last bit; after several it is zero.
         """
         with self.lock, collected():
             batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
@@ -86,7 +86,9 @@ class Engine:
                 mujoco.mj_getState(models[i], data, rows[i], EVERY)
 
         self._share(work, self.memory, len(rows))
-        return {name: rows[:, None, self.places[name]] for name in MOTION} | {"warmstart": rows[:, self.places["warmstart"]]}
+        return {name: rows[:, None, self.places[name]] for name in MOTION} | {
+            "warmstart": rows[:, self.places["warmstart"]]
+        }
 
     def _run(self, models: list[mujoco.MjModel], rows: np.ndarray, inputs: _Arrays) -> dict[str, np.ndarray]:
         """Return the same of many steps, by the pool of rollouts."""
@@ -97,12 +99,16 @@ class Engine:
             width = math.prod(value.shape[2:])
             given[..., place : place + width] = value.reshape(*value.shape[:2], width)
         warm = rows[:, self.places["warmstart"]]
-        return self._motions(self._together(rows, models, given, initial_warmstart=warm))
+        return self._motions(self._together(rows, models, given, warm))
 
-    def _together(self, rows: np.ndarray, models: list[mujoco.MjModel], given: np.ndarray, **how: np.ndarray) -> np.ndarray:
+    def _together(
+        self, rows: np.ndarray, models: list[mujoco.MjModel], given: np.ndarray, warm: np.ndarray
+    ) -> np.ndarray:
         """Return physical states after each step of several motions at once."""
         full = np.concatenate([rows[:, self.places[name]] for name in START], axis=1)
-        return np.asarray(self.pool.rollout(models, self.memory, full, given, control_spec=USER, **how)[0])
+        return np.asarray(
+            self.pool.rollout(models, self.memory, full, given, control_spec=USER, initial_warmstart=warm)[0]
+        )
 
     def _motions(self, found: np.ndarray) -> dict[str, np.ndarray]:
         """Return the parts of physical states, of which plugins come last."""
@@ -113,7 +119,7 @@ class Engine:
         """Return the motions after single steps of many states."""
         user = rows[:, None, self.places["ctrl"].start : self.places["mocap_quat"].stop]
         warm = rows[:, self.places["warmstart"]]
-        parts = self._motions(self._together(rows, models, user, initial_warmstart=warm)[:, 0])
+        parts = self._motions(self._together(rows, models, user, warm)[:, 0])
         return np.concatenate([parts[name] for name in MOTION], axis=-1)
 
     def steer(
@@ -183,10 +189,10 @@ class Engine:
     ) -> dict[str, np.ndarray]:  # fmt: skip
         num, steps = inputs["ctrl"].shape[:2]
         rows = self._rows({k: v.reshape(num * steps, *v.shape[2:]) for k, v in {**before, **inputs}.items()})
-        every = rows.reshape(num, steps, -1)
-        speeds = every[..., self.places["qvel"]]
         # Nearly the acceleration that a solve will find.
-        every[:, :-1, self.places["warmstart"]] = np.diff(speeds, axis=1) / self.mj_model.opt.timestep
+        courses = rows.reshape(num, steps, -1)
+        changes = np.diff(courses[..., self.places["qvel"]], axis=1)
+        courses[:, :-1, self.places["warmstart"]] = changes / self.mj_model.opt.timestep
         exact = {id(model): self._exact(model) for model in models}
         every = [exact[id(model)] for model in models for _ in range(steps)]
         shapes = self.shapes(wanted, sizes)
@@ -195,7 +201,9 @@ class Engine:
         speeds: dict[int, list] = {}
         for one, course in zip(every[::steps], before["qvel"], strict=True):
             speeds.setdefault(id(one), []).append(course)
-        reached = {key: (one := np.concatenate(courses))[np.isfinite(one).all(axis=1)] for key, courses in speeds.items()}
+        reached = {
+            key: (one := np.concatenate(courses))[np.isfinite(one).all(axis=1)] for key, courses in speeds.items()
+        }
         work = Steps(rows, every, reached, gradient, flat, np.zeros(len(rows), bool))
         self._share(lambda worker, piece: worker.fill(work, piece), self.workers, len(rows))
         if "apart" in wanted:
@@ -264,7 +272,10 @@ class Engine:
 
             each = [
                 {name: one[name][t] for name in ("state", *PAIRS) if name in one}
-                | {"by state": added(t, "", size), "by felt": added(t, "felt ", one["felt"].shape[1]) if "felt" in one else 0.0}
+                | {
+                    "by state": added(t, "", size),
+                    "by felt": added(t, "felt ", one["felt"].shape[1]) if "felt" in one else 0.0,
+                }
                 for t in range(steps)
             ]
             main, held, total = np.eye(size, width), np.zeros((NUM_SLOTS, width)), None
@@ -277,7 +288,12 @@ class Engine:
         return dict(zip(sizes, parts, strict=True)) | {"end": np.where(is_good, end, np.nan)}
 
     def follow(
-        self, gradient: Gradient, numbers: _Arrays, start: _Arrays, inputs: _Arrays, changes: tuple[np.ndarray, np.ndarray]
+        self,
+        gradient: Gradient,
+        numbers: _Arrays,
+        start: _Arrays,
+        inputs: _Arrays,
+        changes: tuple[np.ndarray, np.ndarray],
     ) -> dict[str, np.ndarray]:
         """Return a motion as `run` does and, as "change", what becomes of a change of the start and of the controls."""
         after = self.run(numbers, start, inputs)
@@ -289,7 +305,7 @@ class Engine:
         together = max(1, int(_MOST_NUMBERS / (steps * size * (2 * size + NUM_SLOTS))))
         for first in range(0, num, together):
             part = slice(first, first + together)
-            cut = lambda arrays: {k: v[part] if len(v) == num else v for k, v in arrays.items()}  # noqa: E731
+            cut = functools.partial(_part, part, num)
             flight = self.no_flight((len(range(num)[part]),))
             found = self.maps(cut(numbers), cut(before), cut(inputs), flight, gradient=gradient, wanted=names)
             for k, motion in enumerate(range(num)[part]):
@@ -328,7 +344,9 @@ class Engine:
             first = np.broadcast_to(first, (*after[name].shape[:-2], 1, after[name].shape[-1]))
             found[name] = np.concatenate([first, after[name][..., :-1, :]], axis=-2)
         steps = after["qpos"].shape[-2]
-        found["time"] = np.asarray(start["time"], float)[..., None, :] + self.mj_model.opt.timestep * np.arange(steps)[:, None]
+        found["time"] = (
+            np.asarray(start["time"], float)[..., None, :] + self.mj_model.opt.timestep * np.arange(steps)[:, None]
+        )
         return found
 
     def _exact(self, model: mujoco.MjModel) -> mujoco.MjModel:
@@ -380,3 +398,8 @@ class Engine:
         for name, value in start.items():
             rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
         return rows
+
+
+def _part(part: slice, count: int, arrays: _Arrays) -> dict[str, np.ndarray]:
+    """Return some of a batch; what all share stays."""
+    return {name: value[part] if len(value) == count else value for name, value in arrays.items()}

@@ -1,10 +1,10 @@
 """Rollouts of C MuJoCo under `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`.
 
 The motion is one call; the derivatives of all its steps are another, once the motion is known, and the recursion of
-`engines.stepmap` takes a change of the start to the end. JAX transposes that recursion, so forward and reverse mode are one formula.
+`engines.stepmap` takes a change of the start to the end. JAX transposes that recursion: forward and reverse mode are one formula.
 
-Pairs of motions that are in flight at the end (see `engines.flight`) are part of the state, so that a rollout that goes on from
-there, one step of a policy or of an environment, has the derivative of one that was never interrupted. They are only there
+Pairs of motions that are in flight at the end (see `engines.flight`) are part of the state, so that a rollout that goes on
+from there, one step of a policy or of an environment, has the derivative of one that was never interrupted. They are only there
 while JAX differentiates: elsewhere nobody asks for them.
 """
 
@@ -67,7 +67,7 @@ def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) 
             start["time"]
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
-        wanted = with_pairs(tuple(given)) + ("flight",) if gradient == "slope" else tuple(given)
+        wanted = (*with_pairs(tuple(given)), "flight") if gradient == "slope" else tuple(given)
         maps = _maps(engine, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
         forced = {part: jnp.zeros(maps[part].shape[:2], dtype) for part in ("state", "felt") if part in maps}
         for part, name in itertools.product(forced, given):
@@ -94,7 +94,10 @@ def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) 
         parts = jnp.split(course, np.cumsum(sizes)[:-1].tolist(), axis=1)
         parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])
         own = nothing() if gradient == "discrete" else {"flight": maps["flight"], "held": jnp.zeros_like(held)}
-        change = {"flight": jnp.zeros_like(own["flight"]), "held": jnp.zeros_like(held) if gradient == "discrete" else held}
+        change = {
+            "flight": jnp.zeros_like(own["flight"]),
+            "held": jnp.zeros_like(held) if gradient == "discrete" else held,
+        }
         change["warmstart"] = jnp.zeros_like(start["qvel"])
         return found | own, dict(zip(MOTION, parts, strict=True)) | change
 
@@ -112,7 +115,9 @@ def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tupl
     return jnp.concatenate([first[None], found["states"]]), found["controls"]
 
 
-def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]) -> dict[str, Array]:
+def product(
+    scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]
+) -> dict[str, Array]:
     """Return the derivative of several steps by "state" and inputs that are held, and "end", the state after them."""
     engine = engine_of(scene.mj_model)
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()}
@@ -121,13 +126,18 @@ def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient
     return _once(function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
 
 
-def linearise(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient) -> tuple[Array, Array, Array, Array]:
+def linearise(
+    scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient
+) -> tuple[Array, Array, Array, Array]:
     """Return the derivatives of one step and of its sensors by state and controls: A, B, C and D."""
     engine, before = engine_of(scene.mj_model), {name: x[None] for name, x in start.items()}
     numbers, dtype, size = changed_numbers(scene), start["qpos"].dtype, engine.layout.num_changes
     flight = jnp.zeros(engine.flight_shape, dtype)
     found = _maps(engine, numbers, before, inputs, flight, gradient=gradient, wanted=("ctrl",))
-    shapes = {"state": (1, scene.mj_model.nsensordata, size), "ctrl": (1, scene.mj_model.nsensordata, scene.mj_model.nu)}
+    shapes = {
+        "state": (1, scene.mj_model.nsensordata, size),
+        "ctrl": (1, scene.mj_model.nsensordata, scene.mj_model.nu),
+    }
     sensed = _once(functools.partial(engine.sense, wanted=("state", "ctrl")), shapes, dtype, numbers, before, inputs)
     return found["state"][0], found["ctrl"][0], sensed["state"][0], sensed["ctrl"][0]
 
@@ -147,7 +157,11 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
         numbers, states, inputs = primals
         by_number, by_state, by_input = tangents
         given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
-        sizes = {name: primal[name].size // (times if primal is inputs else 1) for primal in (inputs, numbers) for name in primal}
+        sizes = {
+            name: primal[name].size // (times if primal is inputs else 1)
+            for primal in (inputs, numbers)
+            for name in primal
+        }
         sizes["state"] = engine.layout.num_changes
         wanted = ("state", *given)
         shapes = {name: (times, count, sizes[name]) for name in wanted}
@@ -162,13 +176,17 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
         change = jnp.einsum("tsc,tc->ts", found["state"], jnp.concatenate(parts, axis=1), precision="highest")
         for name, tangent in given.items():
             own = tangent.reshape((times, -1) if name in by_input else -1).astype(dtype)
-            change += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", found[name], own, precision="highest")
+            change += jnp.einsum(
+                "tsc,tc->ts" if name in by_input else "tsc,c->ts", found[name], own, precision="highest"
+            )
         return call(*primals), change
 
     return call(changed_numbers(scene), dict(states), dict(inputs))
 
 
-def _maps(engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any) -> dict[str, Array]:
+def _maps(
+    engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
+) -> dict[str, Array]:
     """Return what `Engine.maps` gives of states before each step."""
     horizon = len(inputs["ctrl"])
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}

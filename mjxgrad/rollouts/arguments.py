@@ -93,7 +93,10 @@ def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str
     """Return a state, and the scene's inputs beside controls where C MuJoCo begins with others, as `engines` takes them."""
     state, engine = complete(scene, state), engine_of(scene.mj_model)
     start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
-    start |= {"history": state.history[: engine.first["history"].size], "plugin": state.history[engine.first["history"].size :]}
+    start |= {
+        "history": state.history[: engine.first["history"].size],
+        "plugin": state.history[engine.first["history"].size :],
+    }
     given = {name: getattr(scene.data, name) for name in INPUTS[1:]}
     is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(engine.start, name))  # noqa: E731
     return start, {name: value for name, value in given.items() if value.size and not is_own(name)}

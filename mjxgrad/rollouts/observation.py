@@ -13,10 +13,25 @@ from mjxgrad.rollouts.arguments import Observe, arguments_of
 from mjxgrad.rollouts.state import State, data_of
 from mjxgrad.scene import Scene
 
-_PLACES = ("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat", "subtree_com")
+_PLACES = (
+    "xpos",
+    "xquat",
+    "xmat",
+    "xipos",
+    "ximat",
+    "xanchor",
+    "xaxis",
+    "geom_xpos",
+    "geom_xmat",
+    "site_xpos",
+    "site_xmat",
+    "subtree_com",
+)
 
 
-def observed(scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: dict[str, Array], observe: Observe) -> PyTree:
+def observed(
+    scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: dict[str, Array], observe: Observe
+) -> PyTree:
     """Return what a function of model and data sees in a state under a control, by C MuJoCo's sensors."""
     start, resting = arguments_of(scene, state)
     given = {name: value[None] for name, value in (resting | inputs | {"ctrl": ctrl}).items()}

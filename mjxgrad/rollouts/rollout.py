@@ -270,12 +270,16 @@ def _by_mujoco(
         def advance(carry: tuple[State, Array, Array], given: tuple[Array, Array, _Inputs]) -> tuple:
             state, first_bad, before = carry
             index, disturbance, row = given
-            seen = observed(scene, state, before, row, observe) if looks else None
+            seen = observed(scene, state, before, row, observe) if looks and observe is not None else None
             ctrl = one_each(controls(params, seen if looks else state), scene.model.nu) + disturbance
             one, _ = _course(scene, state, ctrl[None], jax.tree.map(lambda x: x[None], row), gradient)
             first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
             moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
-            return (moved, first_bad, ctrl.astype(before.dtype)), ((state.qpos, state.qvel, state.act, state.history), ctrl, seen)
+            return (moved, first_bad, ctrl.astype(before.dtype)), (
+                (state.qpos, state.qvel, state.act, state.history),
+                ctrl,
+                seen,
+            )
 
         # Step by step, since each control depends on the state before it.
         rows = (jnp.arange(len(noise), dtype=jnp.int32), noise, inputs)
@@ -333,7 +337,9 @@ def _course(
     return _trajectory((qpos, qvel, act), final, ctrl, first_bad), history
 
 
-def _trajectory(states: Sequence[Array], final: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]) -> Trajectory:
+def _trajectory(
+    states: Sequence[Array], final: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]
+) -> Trajectory:
     qpos, qvel, act, *_ = states
     return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act)  # pyright: ignore[reportCallIssue]
 

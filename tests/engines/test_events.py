@@ -9,8 +9,8 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
-from mjxgrad.engines.mujoco import Engine
 from mjxgrad.engines.events import Surfaces, _by_modes, levers_of
+from mjxgrad.engines.mujoco import Engine
 from tests.scenes import ASSETS
 
 BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
@@ -105,12 +105,19 @@ def test_an_event_is_a_gap_within_half_a_step_of_travel():
             np.testing.assert_allclose(found.rows @ found.moves, [[1.0]])
 
 
-def test_without_speed_the_impedance_gives_the_width():
+def test_a_slow_contact_has_the_impedances_width():
     """0.06 of its width, 1 mm by default, or less where a step of free acceleration moves less: 39 µm in 2 ms."""
     for h, width in ((0.003, 6e-5), (0.002, 3.924e-5)):
-        assert _events(BALL.format(h=h), [0.99 * width - 0.1], [0.0]) is not None
-        assert _events(BALL.format(h=h), [1.01 * width - 0.1], [0.0]) is None
-        assert _events(BALL.format(h=h), [0.99 * width - 0.1], [0.0], free=0.0) is None
+        assert _events(BALL.format(h=h), [0.99 * width - 0.1], [-0.01]) is not None
+        assert _events(BALL.format(h=h), [1.01 * width - 0.1], [-0.01]) is None
+        assert _events(BALL.format(h=h), [0.99 * width - 0.1], [-0.01], free=0.0) is None
+
+
+def test_a_contact_that_rests_is_no_event_however_near_its_surface():
+    """Four steps of its travel reach: at 1 mm/s and 2 ms these are 8 µm."""
+    for gap, is_event in ((-7.9e-6, True), (-8.1e-6, False)):
+        assert (_events(BALL.format(h=0.002), [gap - 0.1], [1e-3]) is not None) == is_event
+    assert _events(BALL.format(h=0.002), [-2e-5 - 0.1], [0.0]) is None
 
 
 def test_a_joint_that_creeps_to_its_limit_does_not_feel_it_before():

@@ -9,22 +9,34 @@ from mjxgrad.engines.layout import Layout
 from mjxgrad.engines.stepmap import advance, begin
 
 # One slide without forces: a state is a place and a speed, and a step of a pair is whatever a test says.
-MODEL = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody></mujoco>")
+MODEL = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody></mujoco>"
+)
 LAYOUT = Layout(MODEL)
 WIDTH = 2.0
 
 
 def _nothing():
-    return Flight.unpacked(np.zeros((1, flights.NUM_SLOTS, 2 * LAYOUT.num_changes + 3)), LAYOUT, np.zeros((1, LAYOUT.size)))
+    return Flight.unpacked(
+        np.zeros((1, flights.NUM_SLOTS, 2 * LAYOUT.num_changes + 3)), LAYOUT, np.zeros((1, LAYOUT.size))
+    )
 
 
 def _flown(matrices, begun, factors):
     """Return what is found of a motion at rest, whose pairs are `factors` times as far apart after each step."""
     steps, slots = len(matrices), flights.NUM_SLOTS
     rows = np.zeros((1, steps, LAYOUT.size))
-    course = Course(rows, np.array(matrices, float)[None], {(0, t): one for t, one in begun.items()}, lambda *_: MODEL, np.ones((1, steps), bool))
+    course = Course(
+        rows,
+        np.array(matrices, float)[None],
+        {(0, t): one for t, one in begun.items()},
+        lambda *_: MODEL,
+        np.ones((1, steps), bool),
+    )
     shapes = {"felt": (steps, 1, 2), "slot": (steps, 1), "apart": (steps, 2, slots), "stays": (steps, slots)}
-    found = {name: np.zeros((1, *shape)) for name, shape in {**shapes, "before": (2, slots), "enters": (slots,)}.items()}
+    found = {
+        name: np.zeros((1, *shape)) for name, shape in {**shapes, "before": (2, slots), "enters": (slots,)}.items()
+    }
     times = iter(factors)
 
     def step(states, models):
@@ -77,7 +89,10 @@ def test_an_event_lets_go_what_is_less_apart_than_its_window():
 def test_a_pair_to_one_side_of_an_event_is_explained_by_small_differences():
     """The event's own jump would carry it elsewhere; a pair that does not span it goes as if there were none."""
     lost = np.array([[0.5], [0.0]])
-    events = {t: Begun(np.array([[1.0, 0.0]]), np.zeros((1, 2, 2)), np.array([1e-3]), np.array([[5.0, 0.0]]), lost) for t in range(1, 9)}
+    events = {
+        t: Begun(np.array([[1.0, 0.0]]), np.zeros((1, 2, 2)), np.array([1e-3]), np.array([[5.0, 0.0]]), lost)
+        for t in range(1, 9)
+    }
     found = _flown([0 * HALF] * 9, {0: _begun([1.0, 0.0])} | events, [0.5] * 9)
     assert _lasted(found) == 4
 
