@@ -60,7 +60,7 @@ mujoco4: .venv/.installed  ## run C's engine, check and sweep beside a later MuJ
 	@test -d .cache/mujoco4 || { $(PYTHON) -m venv .cache/mujoco4 && grep -v ^mujoco .ci/constraints.txt > .cache/others.txt; }
 	@.cache/mujoco4/bin/python -m pip install --quiet --disable-pip-version-check --constraint .cache/others.txt \
 	    --editable '.[test]' 'mujoco$(MUJOCO)'
-	@.cache/mujoco4/bin/python -m pytest -n 2 --dist worksteal tests/native tests/checking $(PYTEST_ARGS)
+	@.cache/mujoco4/bin/python -m pytest -n 2 --dist worksteal tests/engines tests/checking $(PYTEST_ARGS)
 
 bench: .venv/.installed  ## measure speed and memory against mjx.step
 	@$(BIN)/python -m experiments bench $(ARGS)

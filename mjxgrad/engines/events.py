@@ -31,7 +31,7 @@ an event costs four more steps, and a step without any costs nothing.
   impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply. These move by about as much as
   a step of free acceleration a, less what damping keeps of it, h² |J a|. ε is no larger, since a window that is wider than the
   travel of what lands or creeps slowly biases it; and it is at most four steps of travel, since a contact that rests a few
-  micrometres deep crosses nothing. Taken for events, resting corners of a box that an arm pushes took most of its gradient's time.
+  micrometres deep crosses nothing. As events, resting corners of a box that an arm pushes took most of its gradient's time.
 - **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
   its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
 - **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.

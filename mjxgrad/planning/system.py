@@ -134,7 +134,7 @@ class SceneSystem(System):
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
     def steer(self, **law: Array) -> tuple[Float[Array, "states state"], Float[Array, "horizon m"]]:
-        """Return C MuJoCo's states and controls under a feedback law, see `native.engine.Engine.steer`."""
+        """Return C MuJoCo's states and controls under a feedback law, see `engines.mujoco.Engine.steer`."""
         begin, resting = arguments_of(self.scene, self._unflattened(law["states"][0]))
         return steer(self.scene, {"time": begin["time"], **resting}, law, self.num_substeps)
 

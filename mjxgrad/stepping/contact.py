@@ -51,7 +51,7 @@ class Slope(OwnMotion):
     """MuJoCo's own motion, with the derivative whose mean is the slope of the outcome; see `OwnMotion`.
 
     It includes the moving times of contact and limit events: along MuJoCo's motion, it is the derivative of a step with an
-    onset. See `native.events` for C MuJoCo.
+    onset. See `engines.events` for C MuJoCo.
     """
 
     gradient = "slope"

@@ -86,7 +86,7 @@ _SLIP = 3.0
 # Factor on the acceleration by motors in the width, and its bound in widths of the impedance. With less of either, feet of MuJoCo
 # Playground's robots chatter; without a bound, a strong servo holds a light link off the floor.
 _PRESS, _WIDEST = 3.0, 10.0
-# Half the ramp's least width along MuJoCo's own motion, in widths of the impedance; as in `native.events` for C MuJoCo's step.
+# Half the ramp's least width along MuJoCo's own motion, in widths of the impedance; as in `engines.events` for C MuJoCo's step.
 _AT_MOTION = 0.06
 # Width of an impedance (m) beyond any contact, and the width used in its place.
 _ENDLESS, _USUAL_WIDTH = 1e3, 1e-3
