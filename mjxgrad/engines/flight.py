@@ -9,7 +9,7 @@ after j steps over their distance before, and h the share of that distance by wh
 A is the derivative along the motion without events, F what each event that begins feels. A pair that is let go joins x.
 
 - **Explained.** A pair is explained after three steps in a row in which D' is A D to a twentieth. An event between the two adds
-  its jump to A D, if they lie to either side of it; if they do not, it adds what a small difference does. Either explains.
+  its jump to A D. If it is less far apart than half of the event's window, it may add what a small difference does instead.
 - **Let go.** Once explained, it is let go if it is at most ten times as far apart as at first; or, at an event, if it is less far
   apart than the event's own window. That event then has a better mean of its phases than two motions have. Motions that are
   farther apart span many phases of the next event, where a derivative multiplies. After a hundred steps all are let go.
@@ -33,6 +33,7 @@ from mjxgrad.engines.layout import Layout
 _NUM_ALIKE, _ALIKE = 3, 0.05
 _FAR = 10.0  # times the distance at first; a falling arm that bounces twice is off with 5
 _LONGEST = 100
+_BESIDE = 0.5  # of an event's window, up to which a pair may lie to one side of it; a falling arm is off without
 NUM_SLOTS = 96
 _STEPS = 10  # over which a difference of velocities is one of positions
 
@@ -202,8 +203,12 @@ def _advance(
         if (one := course.begun.get((int(motions[begin]), t))) is not None:
             own = slice(begin, end)
             felt, left = before[own] @ one.felt.T, apart[own] - expected[own]
-            ways = [felt @ one.apart] + ([] if one.lost is None else [felt @ one.lost.T])
-            off[own] = np.min([np.linalg.norm(scale * (left - way), axis=-1) for way in ways], axis=0)
+            off[own] = np.linalg.norm(scale * (left - felt @ one.apart), axis=-1)
+            if one.lost is not None:
+                reach = np.abs(felt) * flight.widths[motions[own], slots[own]][:, None]
+                beside = np.linalg.norm(scale * (left - felt @ one.lost.T), axis=-1)
+                is_beside = (reach <= _BESIDE * one.widths).all(axis=1)
+                off[own] = np.where(is_beside, np.minimum(off[own], beside), off[own])
     is_sound = np.isfinite(apart).all(axis=-1) & course.is_finite[motions, t]
     known = off <= _ALIKE * np.linalg.norm(scale * apart, axis=-1)
     flight.alike[motions, slots] = np.where(known, flight.alike[motions, slots] + 1, 0)
