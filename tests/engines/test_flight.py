@@ -87,14 +87,12 @@ def test_an_event_lets_go_what_is_less_apart_than_its_window():
 
 
 def test_a_pair_to_one_side_of_an_event_is_explained_by_small_differences():
-    """The event's own jump would carry it elsewhere; a pair that does not span it goes as if there were none."""
+    """The event's own jump would carry it elsewhere. One that may span the event, apart by more than half its window, is not."""
     lost = np.array([[0.5], [0.0]])
-    events = {
-        t: Begun(np.array([[1.0, 0.0]]), np.zeros((1, 2, 2)), np.array([1e-3]), np.array([[5.0, 0.0]]), lost)
-        for t in range(1, 9)
-    }
-    found = _flown([0 * HALF] * 9, {0: _begun([1.0, 0.0])} | events, [0.5] * 9)
-    assert _lasted(found) == 4
+    for width, lasts in ((10.0, 4), (1e-3, 10)):
+        ends, jump = np.zeros((1, 2, 2)), np.array([[5.0, 0.0]])
+        events = {t: Begun(np.array([[1.0, 0.0]]), ends, np.array([width]), jump, lost) for t in range(1, 9)}
+        assert _lasted(_flown([0 * HALF] * 9, {0: _begun([1.0, 0.0])} | events, [0.5] * 9)) == lasts
 
 
 def test_what_pairs_add_is_the_sum_of_their_differences():
