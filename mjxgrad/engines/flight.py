@@ -47,7 +47,7 @@ class Begun:
         ends: both motions after the step.
         widths: how far apart each pair began.
         apart: D after the step.
-        lost: what small differences have along the displacements that events replace.
+        lost: small differences along the displacements that events replace.
         longest: after how many steps these pairs are let go in any case.
         by_others: F, by each entry of what else moves gaps.
     """
@@ -128,9 +128,9 @@ def fly(
     """Take pairs through all steps of a course, and write what the recursion needs.
 
     Args:
-        flight: what is in flight before; it is left as it is after the last step.
+        flight: pairs in flight before; it is left as it is after the last step.
         course: the motions that it is beside.
-        layout: of states.
+        layout: places in states.
         lengths: how far each velocity moves the farthest point of its bodies.
         timestep: h (s).
         step: function from states and models to the motions after a step.

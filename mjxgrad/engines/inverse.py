@@ -353,11 +353,11 @@ def step_of(
     """Return the derivatives of steps by "state" and by what else is named, from those of R, inputs first.
 
     Args:
-        layout: of the model.
+        layout: the model's.
         timestep: h.
         speeds: velocities after the steps.
         found: "qpos", "qvel", "qacc" and "act" of R, and of each name, with "next" of activations where the model has any.
-        names: of other inputs and numbers.
+        names: other inputs, and numbers.
     """
     nv, na = layout.nv, found["act"].shape[-2]
     every = ["qpos", "qvel", "act", *names]

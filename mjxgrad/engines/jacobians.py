@@ -54,8 +54,8 @@ class Steps:
 
     Attributes:
         rows: whole states of MuJoCo before each.
-        models: of each, shared where they are the same.
-        speeds: of each model, velocities that its motions reach.
+        models: one of each, shared where they are the same.
+        speeds: velocities that the motions of each model reach.
         gradient: "discrete" or "slope".
         found: arrays to be written, by name, with one entry per row.
         begun: pairs that begin, by row.
@@ -79,7 +79,7 @@ class _Row:
 
     Attributes:
         before, after: whole states before and after the step.
-        found: what is to be written of it.
+        found: its part of what is to be written.
         raw: derivatives of R, inputs first.
         by: inverse dynamics, also of another model where rounding decides.
         clear: the state about which no small difference crosses a surface.

@@ -25,8 +25,8 @@ class Layout:
     """The places of a model's states and changes.
 
     Attributes:
-        places: of each part in MuJoCo's vector of everything that a step depends on.
-        sizes: of each part of a motion.
+        places: slices of MuJoCo's vector of everything that a step depends on, by part.
+        sizes: numbers in each part of a motion.
         num_changes: numbers of a change: of positions and velocities, and of the rest.
     """
 

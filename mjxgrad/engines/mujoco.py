@@ -166,9 +166,9 @@ class Engine:
         """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted.
 
         Args:
-            numbers: of the model, that differ from the file's.
+            numbers: those of the model that differ from the file's.
             before: states before each step, with an axis of steps as inputs have it.
-            inputs: of each step.
+            inputs: one of each step.
             flight: pairs in flight before the first step, packed; see `engines.flight`.
             gradient: "discrete" or "slope".
             wanted: names; with those of `stepmap.PAIRS` pairs of motions are followed from step to step, and "flight" has them
@@ -328,7 +328,7 @@ class Engine:
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the derivatives of one step, of its end by all that is wanted.
 
-        Of a whole motion are those of `ONCE`.
+        Those of `ONCE` belong to a whole motion.
         """
         model, size = self.mj_model, self.layout.num_changes
         own = {"felt": (model.nv, size), "slot": (model.nv,), "apart": (size, NUM_SLOTS), "stays": (NUM_SLOTS,)}
@@ -387,9 +387,10 @@ class Engine:
         """
         given = np.asarray(value)
         found = given.astype(float)
-        if name == "qpos" and given.dtype == np.float32:
+        if name in ("qpos", "states") and given.dtype == np.float32:  # of a law, whose states begin with positions
+            nq = self.mj_model.nq
             for pose in self.poses:
-                np.copyto(found, pose, where=given == pose.astype(np.float32))
+                np.copyto(found[..., :nq], pose, where=given[..., :nq] == pose.astype(np.float32))
         return found
 
     def _rows(self, start: _Arrays) -> Float[np.ndarray, "rows size"]:

@@ -23,7 +23,7 @@ def advance(xp: Any, main: Any, held: Any, step: dict[str, Any]) -> tuple[Any, A
     Args:
         xp: `numpy` or `jax.numpy`.
         main: the change, of one column or several.
-        held: what each slot has felt.
+        held: a number for each slot, which it has felt.
         step: "state", "by state", what the step adds to a change; of a slope, "felt", "by felt", "slot", "apart", "stays".
     """
     end = step["state"] @ main + step["by state"]

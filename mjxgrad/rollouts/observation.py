@@ -1,4 +1,4 @@
-"""What is seen in a state: the complete data of it by MJX, sensors and places by C MuJoCo."""
+"""Observations of a state that C MuJoCo steps: its sensors, and the places of bodies, geoms and sites."""
 
 from typing import Any
 

@@ -46,8 +46,8 @@ class State(eqx.Module):
         act: actuator activations.
         time: simulated time (s).
         warmstart: acceleration at which the next solve starts. It affects the solve's duration, not its result.
-        history: of actuators and sensors with a delay, and states of plugins; as MuJoCo keeps them.
-        pairs: what a slope by C MuJoCo goes on with; None where MJX steps the scene.
+        history: past controls and readings, of delays, and states of plugins; as MuJoCo keeps them.
+        pairs: pairs of motions that a slope by C MuJoCo follows; None where MJX steps the scene.
     """
 
     qpos: Float[Array, " nq"]
