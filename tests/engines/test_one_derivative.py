@@ -181,3 +181,52 @@ def test_a_start_on_the_floor_is_that_of_the_file_in_single_precision():
     np.testing.assert_array_equal(engine._exactly("qpos", rounded), model.qpos0)
     moved = rounded + np.float32(1e-3)
     np.testing.assert_array_equal(engine._exactly("qpos", moved)[2], float(moved[2]))
+
+
+def test_a_sensor_that_only_c_mujoco_has_is_a_cost():
+    """The distance of a rod from a ball, against differences of C MuJoCo's own reading."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body pos="0 0 1"><joint name="a" axis="0 1 0"/>
+        <geom name="rod" type="capsule" fromto="0 0 0 .4 0 0" size=".03"/></body><geom name="ball" size=".1" pos=".3 .3 .5"/>
+        </worldbody><actuator><motor joint="a"/></actuator>
+        <sensor><distance geom1="rod" geom2="ball" cutoff="5"/></sensor></mujoco>"""
+    )
+    scene = mg.load_scene(model, engine="mujoco")
+
+    def reading(torque):
+        start, controls = mg.initial_state(scene), torque * jnp.ones((30, 1))
+        found = mg.rollout(scene, start, controls, observe=lambda model, data: data.sensordata, contact=mg.Discrete())
+        return found.observations[-1, 0]
+
+    def by_mujoco(torque):
+        data = mujoco.MjData(model)
+        for _ in range(30):
+            data.ctrl = torque
+            mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        return data.sensordata[0]
+
+    value, derivative = jax.value_and_grad(reading)(0.2)
+    np.testing.assert_allclose(value, by_mujoco(0.2), rtol=1e-9)
+    np.testing.assert_allclose(derivative, (by_mujoco(0.2 + 1e-6) - by_mujoco(0.2 - 1e-6)) / 2e-6, rtol=1e-5)
+
+
+def test_a_parameter_that_is_zero_is_not_switched_on():
+    """Entries of a DC motor's gain that are zero ask for other activations; those that are not have their derivative."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".05" pos="0 0 -.3"/></body></worldbody>
+        <actuator><dcmotor joint="j" motorconst=".1 .1" resistance="2"/></actuator></mujoco>"""
+    )
+    scene, gains = mg.load_scene(model), np.array(model.actuator_gainprm)
+
+    def end(gains):
+        start = mg.initial_state(scene)
+        changed = scene.with_model(actuator_gainprm=gains)
+        return mg.rollout(changed, start, 3 * jnp.ones((20, 1)), contact=mg.Discrete("mujoco")).qpos[-1, 0]
+
+    gradient = np.asarray(jax.grad(end)(jnp.asarray(gains)))
+    assert np.isfinite(gradient).all()
+    for entry in np.flatnonzero(gains):
+        change = 1e-5 * np.eye(gains.size)[entry].reshape(gains.shape)
+        expected = (end(gains + change) - end(gains - change)) / 2e-5
+        np.testing.assert_allclose(gradient.reshape(-1)[entry], expected, rtol=1e-4)
