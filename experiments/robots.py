@@ -341,8 +341,8 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
         return [off] * (verdict == "off")
     largest, farthest = _LIMITS[part]
     wrong = ["the step diverges"] * found["flagged"]
-    bar = max(largest, 2 * found.get("truth", 0.0))
-    wrong += [f"{name} is off by {found[name]:.1g}" for name in ("A", "B") if not found[name] <= bar]
+    beside = f", differences of another width by {found['truth']:.1g}" if "truth" in found else ""
+    wrong += [f"{name} is off by {found[name]:.1g}{beside}" for name in ("A", "B") if not found[name] <= largest]
     is_silent = not found["motion"] <= farthest and not found["warned"]
     return wrong + [f"motion is off by {found['motion']:.1g} without a warning"] * is_silent
 

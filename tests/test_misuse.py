@@ -163,6 +163,7 @@ FOUND = {
     "roll(jnp.zeros((4, 1)), noise=jnp.zeros((3, 1)))": "must agree on the number of steps, got controls 4",
     "roll()": "horizon must be given",
     "roll(lambda p, s: jnp.array(1.0), horizon=2)": "must return one control per actuator, shape (1,), got",
+    "scene.with_engine('warp')": 'engine must be "mjx" or "mujoco", got',
     "roll(horizon=2, inputs={'ctrl': jnp.zeros((2, 2))})": "inputs must be among qfrc_applied",
     "roll(horizon=2, inputs={'qfrc_applied': jnp.zeros(3)})": "inputs['qfrc_applied'] must have shape (2, 1), one row per step",
     "mg.initial_state(scene, qpos=jnp.zeros(3))": "qpos must have shape (1,) in this scene, got (3,)",

@@ -15,7 +15,8 @@ need no kinematics and no collisions.
 - **Actuators.** Each force depends on the actuator's own length, velocity, control and activations, so all are changed at once,
   and the moment arms carry the result. Where the integrator's matrix depends on controls (muscles, gains by velocity), where
   joints or tendons limit forces, or actuators are coupled, each is changed alone, and R is taken anew.
-- **What has no R**: Runge-Kutta, noslip, delays, plugins, and steps whose residual is not zero. See `engines.differences`.
+- **What has no R**: Runge-Kutta, noslip, delays, plugins, and steps whose residual is not zero. `engines.jacobians` then takes
+  whole steps.
 
 `mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by
 up to a quarter there.
@@ -30,10 +31,8 @@ from jaxtyping import Float
 
 from mjxgrad.engines.layout import EVERY, Layout
 
-_NARROW, _FREE = (
-    2.0**-30,
-    2.0**-22,
-)  # m or rad, with and without constraints; powers of two change a number by just that
+# Of positions with and without constraints (m or rad): powers of two change a number by just that.
+_NARROW, _FREE = 2.0**-30, 2.0**-22
 _SPEED = 2.0**-24  # m/s or rad/s
 _WIDTH = 1e-6  # of activations and controls
 _PUSH = 1e-5  # m/s² or rad/s², by which R is nearly linear: forces have kinks where friction reaches its cone
@@ -207,9 +206,7 @@ class Inverse:
         self.qpos[:], self.qvel[:], self.act[:] = kept
         return end
 
-    def sides(
-        self, ctrl: np.ndarray, width: float, index: np.ndarray | int | slice = slice(None)
-    ) -> tuple[np.ndarray, ...]:
+    def sides(self, ctrl: np.ndarray, width: float, index: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, ...]:
         """Return controls moved up and down, those within their limits no farther, and the distances between."""
         low, high, up, down = self.low[index], self.high[index], ctrl + width, ctrl - width
         is_inside = (ctrl >= low) & (ctrl <= high)
@@ -266,9 +263,8 @@ class Inverse:
                 return by_force, None
             per_act = np.zeros(model.nu)
             per_act[owner] = width
-            return by_force, (ends[0][1] - ends[1][1]) / np.maximum(per_act[self.of_act], 1e-30) * (
-                per_act[self.of_act] > 0
-            )
+            own = per_act[self.of_act]
+            return by_force, np.where(own > 0, (ends[0][1] - ends[1][1]) / np.maximum(own, _TINY), 0.0)
 
         every = np.arange(model.nu)
         by_force, of_next = changes(self.ctrl, every, is_ctrl=True)

@@ -20,7 +20,6 @@ from mjxgrad.engines.flight import Begun
 from mjxgrad.engines.inverse import Inverse
 from mjxgrad.engines.layout import EVERY, INPUTS, Layout
 from mjxgrad.engines.stepmap import FIRST, PAIRS
-from mjxgrad.stepping import Gradient
 
 _WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
@@ -33,7 +32,6 @@ _STEEP, _NARROWER = 10.0, 1 / 30
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
 _OF_TIME = "opt.timestep"
 _KINK = 0.1  # of a derivative, by which its two sides differ at most
-
 _TOGETHER = 64  # rows whose algebra is done at once
 
 _Found = dict[str, np.ndarray]
@@ -66,7 +64,7 @@ class Steps:
     rows: Float[np.ndarray, "rows size"]
     models: list[mujoco.MjModel]
     speeds: Mapping[int, Float[np.ndarray, "some nv"]]
-    gradient: Gradient
+    gradient: str
     found: _Found
     is_finite: Bool[np.ndarray, " rows"]
     begun: dict[int, Begun] = field(default_factory=dict)
@@ -84,7 +82,8 @@ class _Row:
         by: inverse dynamics, also of another model where rounding decides.
         clear: the state about which no small difference crosses a surface.
         near: surfaces near the state.
-        turned: the angles and lengths by which positions move in the step.
+        acceleration: of the step from there.
+        begun: pairs of motions that its events begin.
         is_explicit: whether R has all that the step does.
     """
 
@@ -118,7 +117,7 @@ class Worker:
             for begin in range(0, len(rows), _TOGETHER):
                 self._together(steps, rows[begin : begin + _TOGETHER])
 
-    def _use(self, given: mujoco.MjModel, speeds: np.ndarray, gradient: Gradient) -> None:
+    def _use(self, given: mujoco.MjModel, speeds: np.ndarray, gradient: str) -> None:
         """Take a model for what follows, whose motions move so fast."""
         if given is not self.given:
             self.given, self.model, self.others = given, copy.deepcopy(given), None
@@ -142,7 +141,7 @@ class Worker:
         for _, i, one in done:
             if one.is_explicit and self._is_steep(one):
                 self._beside(steps.gradient, one, names)
-            self._with_events(one, names)
+            self._with_events(one)
             if one.begun is not None:
                 steps.begun[i] = one.begun
             if one.by is not self.inverse:
@@ -222,7 +221,7 @@ class Worker:
         """Return whether differences are steeper than any contact, so that they step over a jump."""
         return not self._steepness(one.found["state"]) <= _STEEP / self.model.opt.timestep
 
-    def _beside(self, gradient: Gradient, one: _Row, names: list[str]) -> None:
+    def _beside(self, gradient: str, one: _Row, names: list[str]) -> None:
         """Differentiate a step anew whose differences are too steep: from beside, and at last by whole steps."""
         if gradient == "discrete":
             self._aside(one)
@@ -276,7 +275,7 @@ class Worker:
             self._by_steps(one)
         self._by_others(one, names[1:])
 
-    def _with_events(self, one: _Row, names: list[str]) -> None:
+    def _with_events(self, one: _Row) -> None:
         """Replace what small differences have along the displacements of events, and average the geometry of edges."""
         events, matrix, nv = one.events, one.found["state"], self.layout.nv
         if one.near is None:

@@ -4,8 +4,6 @@ A state that goes on has positions, velocities and the *rest*: activations, and 
 states of plugins. A change of it has as many numbers as there are velocities in place of positions.
 """
 
-import functools
-
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -96,12 +94,6 @@ class Layout:
         values = values.copy()
         values[..., self.turns, :] = _right_jacobian(turned[..., self.turns]) @ values[..., self.turns, :]
         return values
-
-
-@functools.lru_cache(maxsize=8)
-def layout_of(model: mujoco.MjModel) -> Layout:
-    """Return the layout of a model, which is made once."""
-    return Layout(model)
 
 
 def _times(left: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -1,9 +1,12 @@
 """C MuJoCo on all cores: batches of rollouts, and the derivatives of their steps."""
 
 import functools
+import itertools
 import math
 import os
 import threading
+import time
+import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
@@ -17,14 +20,17 @@ from mjxgrad.engines.events import levers_of
 from mjxgrad.engines.flight import NUM_SLOTS, Course, Flight, fly
 from mjxgrad.engines.jacobians import Steps, Worker, solved, with_pairs
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
+from mjxgrad.engines.processes import are_possible, are_started, processes
 from mjxgrad.engines.stepmap import FIRST, PAIRS, advance
-from mjxgrad.scene.scene import with_numbers
-from mjxgrad.stepping import Gradient
+from mjxgrad.scene.numbers import with_numbers
 
 START = ("time", *MOTION)
 ONCE = (*FIRST, "flight")
 """What is found of a whole motion, not of each of its steps."""
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_NUMBERS = itertools.count()  # of engines
+# Other processes take derivatives of so many steps and more, if they take so long (s) here. Their start takes half a second.
+_FEWEST, _SHORT, _LONG = 32, 0.05, 2.0
 _MOST_NUMBERS = 2e7  # of derivatives that are held at a time, where they are not asked for
 
 _Arrays = Mapping[str, np.ndarray]
@@ -39,10 +45,11 @@ def engine_of(mj_model: mujoco.MjModel) -> "Engine":
 class Engine:
     """A pool of threads for one C model. Arrays have the batch's axes in front, of length one where they are shared."""
 
-    def __init__(self, mj_model: mujoco.MjModel):
+    def __init__(self, mj_model: mujoco.MjModel, *, num_threads: int = _NUM_THREADS):
         self.mj_model, self.lock = mj_model, threading.Lock()
-        self.pool, self.threads = mujoco.rollout.Rollout(nthread=_NUM_THREADS), ThreadPoolExecutor(_NUM_THREADS)
-        self.memory = [mujoco.MjData(mj_model) for _ in range(_NUM_THREADS)]
+        self.num_threads, self.number = num_threads, next(_NUMBERS)
+        self.pool, self.threads = mujoco.rollout.Rollout(nthread=num_threads), ThreadPoolExecutor(num_threads)
+        self.memory = [mujoco.MjData(mj_model) for _ in range(num_threads)]
         self.start, self.layout = mujoco.MjData(mj_model), Layout(mj_model)
         self.places = self.layout.places
         self.plain = with_numbers(mj_model, {})
@@ -52,7 +59,9 @@ class Engine:
         self.exact = (self.plain, solved(self.plain))  # the last of these models, and as it is differentiated
         levers = levers_of(mj_model)
         self.lengths = levers.max(axis=0)
-        self.workers = [Worker(self.layout, levers) for _ in range(_NUM_THREADS)]
+        self.workers = [Worker(self.layout, levers) for _ in range(num_threads)]
+        self.may_share = mj_model.nplugin == 0  # another process may not have its library
+        self.pace, self.spent = 0.0, 0.0  # seconds of a step's derivatives, and of all that were taken
         self.poses = np.concatenate([mj_model.key_qpos, mj_model.qpos0[None]])
         self.template = np.zeros(self.layout.size)
         mujoco.mj_getState(mj_model, self.start, self.template, EVERY)
@@ -65,7 +74,8 @@ class Engine:
         to the last bit; after several it is zero.
         """
         with self.lock, collected():
-            batch, models, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
+            batch, numbers, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
+            models = self._models(numbers, len(start["time"]))
             rows = self._rows(start)
             if "warmstart" in start and inputs["ctrl"].shape[1] == 1:
                 found = self._run_once(models, rows, inputs)
@@ -130,7 +140,8 @@ class Engine:
         A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
         """
         with self.lock, collected():
-            batch, models, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
+            batch, numbers, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
+            models = self._models(numbers, len(start["time"]))
             nq, nv, bits = self.mj_model.nq, self.mj_model.nv, mujoco.mjtState
             motion = bits.mjSTATE_QPOS.value | bits.mjSTATE_QVEL.value | bits.mjSTATE_ACT.value
             found = {"states": np.zeros(law["states"].shape), "controls": np.zeros(law["controls"].shape, dtype)}
@@ -161,7 +172,7 @@ class Engine:
 
     def maps(
         self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
-        gradient: Gradient, wanted: tuple[str, ...],
+        gradient: str, wanted: tuple[str, ...],
     ) -> dict[str, np.ndarray]:  # fmt: skip
         """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted.
 
@@ -175,55 +186,105 @@ class Engine:
                 after the last.
         """
         with self.lock, collected():
-            given = {**before, "flight": flight}
-            batch, models, given, inputs = self._flat(np.ndim(before["time"]) - 2, numbers, given, inputs)
-            flight = given.pop("flight")
-            sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
-            sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
-            found = self._maps(models, given, inputs, flight, gradient, wanted, sizes)
-        return {name: found[name].reshape(*batch, *found[name].shape[1:]) for name in ("state", *wanted)}
+            ndim = np.ndim(before["time"]) - 2
+            batch, numbers, states, inputs, rest = self._flat(ndim, numbers, before, inputs, {"flight": flight})
+            # Nearly the acceleration that a solve will find.
+            states["warmstart"] = np.zeros_like(states["qvel"])
+            states["warmstart"][:, :-1] = np.diff(states["qvel"], axis=1) / self.mj_model.opt.timestep
+            num, steps = inputs["ctrl"].shape[:2]
+            flight = rest["flight"]
+            if "apart" not in wanted and all(len(x) == 1 for x in numbers.values()):  # each step is a piece of its own
+                states, inputs = (
+                    {k: x.reshape(num * steps, 1, *x.shape[2:]) for k, x in y.items()} for y in (states, inputs)
+                )
+                flight = np.zeros((num * steps, 0))
+            found = self._found(numbers, states, inputs, flight, gradient=gradient, wanted=wanted)
+        own = {name: x.shape[1:] if name in ONCE else (steps, *x.shape[2:]) for name, x in found.items()}
+        return {name: found[name].reshape(*batch, *own[name]) for name in ("state", *wanted)}
 
-    def _maps(
-        self, models: list, before: _Arrays, inputs: _Arrays, flight: np.ndarray, gradient: Gradient,
-        wanted: tuple[str, ...], sizes: Mapping[str, int],
+    def _found(
+        self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
+        gradient: str, wanted: tuple[str, ...],
     ) -> dict[str, np.ndarray]:  # fmt: skip
+        """Return the same of one axis of motions, by this process or, where that takes long, by several."""
         num, steps = inputs["ctrl"].shape[:2]
-        rows = self._rows({k: v.reshape(num * steps, *v.shape[2:]) for k, v in {**before, **inputs}.items()})
-        # Nearly the acceleration that a solve will find.
-        courses = rows.reshape(num, steps, -1)
-        changes = np.diff(courses[..., self.places["qvel"]], axis=1)
-        courses[:, :-1, self.places["warmstart"]] = changes / self.mj_model.opt.timestep
-        exact = {id(model): self._exact(model) for model in models}
-        every = [exact[id(model)] for model in models for _ in range(steps)]
-        shapes = self.shapes(wanted, sizes)
-        found = {name: np.zeros((num, steps, *shape)) for name, shape in shapes.items() if name not in ONCE}
-        flat = {name: value.reshape(num * steps, *value.shape[2:]) for name, value in found.items()}
-        speeds: dict[int, list] = {}
-        for one, course in zip(every[::steps], before["qvel"], strict=True):
-            speeds.setdefault(id(one), []).append(course)
-        reached = {
-            key: (one := np.concatenate(courses))[np.isfinite(one).all(axis=1)] for key, courses in speeds.items()
-        }
-        work = Steps(rows, every, reached, gradient, flat, np.zeros(len(rows), bool))
-        self._share(lambda worker, piece: worker.fill(work, piece), self.workers, len(rows))
-        if "apart" in wanted:
-            found |= {name: np.zeros((num, *shapes[name])) for name in FIRST}
-            place = lambda motion, t: motion * steps + t  # noqa: E731
-            course = Course(
-                rows.reshape(num, steps, -1),
-                found["state"],
-                {divmod(i, steps): one for i, one in work.begun.items()},
-                lambda motion, t: work.chosen.get(place(motion, t), every[place(motion, t)]),
-                work.is_finite.reshape(num, steps),
-            )
-            pairs = Flight.unpacked(flight, self.layout, course.rows[:, 0])
-            fly(pairs, course, self.layout, self.lengths, self.mj_model.opt.timestep, self._steps, found)
-            if "flight" in wanted:
-                ends = course.rows[:, -1].copy()
-                if (chosen := np.flatnonzero((pairs.widths > 0).any(axis=1))).size:
-                    ends[np.ix_(chosen, self.layout.motion)] = self._steps(ends[chosen], [models[k] for k in chosen])
-                found["flight"] = pairs.packed(self.layout, ends)
+        sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
+        sizes |= {k: math.prod(v.shape[1:]) for k, v in numbers.items()}
+        shapes = {k: (num, *v) if k in ONCE else (num, steps, *v) for k, v in self.shapes(wanted, sizes).items()}
+
+        def arguments(piece: slice) -> tuple:
+            parts = (_part(piece, num, one) for one in (numbers, before, inputs))
+            return (*parts, flight[piece], gradient, wanted)
+
+        everything = slice(0, num)
+        if self._is_long(num * steps, lambda: arguments(slice(0, 1)), shapes):
+            try:
+                return processes(self.num_threads).share(self.number, self.mj_model, num, shapes, arguments)
+            except OSError as problem:
+                self.may_share = False
+                warnings.warn(f"derivatives are taken by one process, which is slower: {problem}", stacklevel=2)
+        found = {name: np.zeros(shape) for name, shape in shapes.items()}
+        began = time.perf_counter()
+        self.write(found, *arguments(everything))
+        self.spent += time.perf_counter() - began
         return found
+
+    def _is_long(self, count: int, first: Callable[[], tuple], shapes: Mapping[str, tuple[int, ...]]) -> bool:
+        """Return whether several processes should take so many steps, by the time that a first one takes."""
+        if count < _FEWEST or self.num_threads < 2 or not self.may_share or not are_possible():
+            return False
+        if self.pace == 0.0:
+            numbers, before, inputs, _, gradient, _ = first()
+            before, inputs = ({k: x[:, :1] for k, x in part.items()} for part in (before, inputs))
+            found = {name: np.zeros((1, 1, *shapes[name][2:])) for name in ("state", "ctrl") if name in shapes}
+            for _ in range(2):  # a thread's first takes longer
+                began = time.perf_counter()
+                self.write(found, numbers, before, inputs, np.zeros((1, 0)), gradient, tuple(found)[1:])
+                self.pace = time.perf_counter() - began
+        foretold = count * self.pace / self.num_threads
+        return foretold > (_SHORT if are_started() else max(_SHORT, _LONG - self.spent))
+
+    def write(
+        self, found: Mapping[str, np.ndarray], numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray,
+        gradient: str, wanted: tuple[str, ...],
+    ) -> None:  # fmt: skip
+        """Write derivatives of the steps of motions into arrays of zeros."""
+        num, steps = inputs["ctrl"].shape[:2]
+        flat = {k: v.reshape(num * steps, *v.shape[2:]) for k, v in found.items() if k not in ONCE}
+        models = self._models(numbers, num)
+        work = self._work(models, before, inputs, gradient, flat)
+        self._share(lambda worker, piece: worker.fill(work, piece), self.workers, len(work.rows))
+        if "apart" not in wanted:
+            return
+        place = lambda motion, t: motion * steps + t  # noqa: E731
+        course = Course(
+            work.rows.reshape(num, steps, -1),
+            found["state"],
+            {divmod(i, steps): one for i, one in work.begun.items()},
+            lambda motion, t: work.chosen.get(place(motion, t), work.models[place(motion, t)]),
+            work.is_finite.reshape(num, steps),
+        )
+        pairs = Flight.unpacked(flight, self.layout, course.rows[:, 0])
+        fly(pairs, course, self.layout, self.lengths, models[0].opt.timestep, self._steps, found)
+        if "flight" in wanted:
+            ends = course.rows[:, -1].copy()
+            if (chosen := np.flatnonzero((pairs.widths > 0).any(axis=1))).size:
+                ends[np.ix_(chosen, self.layout.motion)] = self._steps(ends[chosen], [models[k] for k in chosen])
+            found["flight"][:] = pairs.packed(self.layout, ends)
+
+    def _work(
+        self, models: list, states: _Arrays, inputs: _Arrays, gradient: str, found: dict[str, np.ndarray]
+    ) -> Steps:
+        """Return the steps from states that have axes of motions and times."""
+        num, times = inputs["ctrl"].shape[:2]
+        rows = self._rows({k: v.reshape(num * times, *v.shape[2:]) for k, v in {**states, **inputs}.items()})
+        exact = {id(model): self._exact(model) for model in models}
+        speeds: dict[int, list] = {}
+        for model, course in zip(models, states["qvel"], strict=True):
+            speeds.setdefault(id(exact[id(model)]), []).append(course[np.isfinite(course).all(axis=1)])
+        reached = {key: np.concatenate(courses) for key, courses in speeds.items()}
+        every = [exact[id(model)] for model in models for _ in range(times)]
+        return Steps(rows, every, reached, gradient, found, np.zeros(len(rows), bool))
 
     def sense(
         self, numbers: _Arrays, states: _Arrays, inputs: _Arrays, *, wanted: tuple[str, ...] = ()
@@ -233,23 +294,20 @@ class Engine:
         States and inputs have an axis of times. Differences are small ones: sensors do not know of events.
         """
         with self.lock, collected():
-            batch, models, states, inputs = self._flat(np.ndim(states["time"]) - 2, numbers, states, inputs)
+            batch, numbers, states, inputs = self._flat(np.ndim(states["time"]) - 2, numbers, states, inputs)
             num, times = inputs["ctrl"].shape[:2]
-            rows = self._rows({k: v.reshape(num * times, *v.shape[2:]) for k, v in {**states, **inputs}.items()})
-            exact = {id(model): self._exact(model) for model in models}
-            every = [exact[id(model)] for model in models for _ in range(times)]
+            models = self._models(numbers, num)
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()} | {"state": self.layout.num_changes}
-            sizes |= {k: math.prod(np.shape(v)[len(batch) :]) for k, v in numbers.items()}
+            sizes |= {k: math.prod(v.shape[1:]) for k, v in numbers.items()}
             count = self.mj_model.nsensordata
             shapes = {name: (count, sizes[name]) for name in wanted} or {"readings": (count,)}
-            found = {name: np.zeros((len(rows), *shape)) for name, shape in shapes.items()}
-            still = {id(one): np.zeros((1, self.layout.nv)) for one in every}
-            work = Steps(rows, every, still, "discrete", found, np.zeros(len(rows), bool))
-            self._share(lambda worker, piece: worker.sense(work, piece), self.workers, len(rows))
+            found = {name: np.zeros((num * times, *shape)) for name, shape in shapes.items()}
+            work = self._work(models, states, inputs, "discrete", found)
+            self._share(lambda worker, piece: worker.sense(work, piece), self.workers, num * times)
         return {name: value.reshape(*batch, times, *value.shape[1:]) for name, value in found.items()}
 
     def product(
-        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]
+        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str, wanted: tuple[str, ...]
     ) -> dict[str, np.ndarray]:
         """Return the derivative of the end of a motion by its start and inputs held all the time, and "end", the state there."""
         steps = np.shape(inputs["ctrl"])[-2]
@@ -270,16 +328,11 @@ class Engine:
                 parts = [one[f"{kind}{k}"][t] if f"{kind}{k}" in one else np.zeros((rows, sizes[k])) for k in wanted]
                 return np.concatenate([np.zeros((rows, size)), *parts], axis=-1)
 
-            each = [
-                {name: one[name][t] for name in ("state", *PAIRS) if name in one}
-                | {
-                    "by state": added(t, "", size),
-                    "by felt": added(t, "felt ", one["felt"].shape[1]) if "felt" in one else 0.0,
-                }
-                for t in range(steps)
-            ]
             main, held, total = np.eye(size, width), np.zeros((NUM_SLOTS, width)), None
-            for step in each:
+            for t in range(steps):
+                step = {name: one[name][t] for name in ("state", *PAIRS) if name in one}
+                step["by state"] = added(t, "", size)
+                step["by felt"] = added(t, "felt ", step["felt"].shape[0]) if "felt" in step else 0.0
                 main, held, total = advance(np, main, held, step)
             ends.append(total)
         parts = np.split(np.reshape(ends, (*batch, size, width)), np.cumsum(list(sizes.values()))[:-1], axis=-1)
@@ -289,7 +342,7 @@ class Engine:
 
     def follow(
         self,
-        gradient: Gradient,
+        gradient: str,
         numbers: _Arrays,
         start: _Arrays,
         inputs: _Arrays,
@@ -357,28 +410,33 @@ class Engine:
 
     def _share(self, work: Callable, workers: list, count: int) -> None:
         """Do so many things on all threads; each takes its piece of them."""
-        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(_NUM_THREADS, count))]
+        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(self.num_threads, count))]
         list(map(work, workers, pieces) if len(pieces) == 1 else self.threads.map(work, workers, pieces))
 
-    def _flat(self, ndim: int, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> tuple:
-        """Return the batch's shape, one model for each of it or for all, and the arrays with one axis for the batch's."""
+    def _flat(self, ndim: int, numbers: _Arrays, *arrays: _Arrays) -> tuple:
+        """Return the batch's shape, numbers and arrays with one axis for it; that of numbers that are shared has length one."""
         values = {name: np.asarray(value) for name, value in numbers.items()}
-        given = [{k: self._exactly(k, v) for k, v in one.items()} for one in (start, inputs)]
+        given = [{k: self._exactly(k, v) for k, v in one.items()} for one in arrays]
         batch = np.broadcast_shapes(*(x.shape[:ndim] for one in (*given, values) for x in one.values()))
 
         def flat(x: np.ndarray) -> np.ndarray:
             return np.broadcast_to(x, batch + x.shape[ndim:]).reshape(math.prod(batch), *x.shape[ndim:])
 
-        varied = {name: flat(x) for name, x in values.items() if math.prod(x.shape[:ndim]) > 1}
-        shared = {k: x.reshape(x.shape[ndim:]) for k, x in values.items() if k not in varied}
+        flattened = {
+            k: flat(v) if math.prod(v.shape[:ndim]) > 1 else v.reshape(1, *v.shape[ndim:]) for k, v in values.items()
+        }
+        return batch, flattened, *({k: flat(v) for k, v in one.items()} for one in given)
+
+    def _models(self, numbers: _Arrays, count: int) -> list[mujoco.MjModel]:
+        """Return a model for each of so many motions, of numbers that have an axis of them, or one of length one."""
+        shared = {k: x[0] for k, x in numbers.items() if len(x) == 1}
         content = {k: x.tobytes() for k, x in shared.items()}
         if content != self.kept[0]:
             self.kept = (content, with_numbers(self.plain, shared))
-        base = self.kept[1]
-        models = [base] * math.prod(batch)
-        if varied:
-            models = [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(len(models))]
-        return batch, models, *({k: flat(v) for k, v in one.items()} for one in given)
+        base, varied = self.kept[1], {k: x for k, x in numbers.items() if len(x) > 1}
+        if not varied:
+            return [base] * count
+        return [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(count)]
 
     def _exactly(self, name: str, value: np.ndarray) -> np.ndarray:
         """Return an array in double precision; positions that single precision rounded have the digits of the file again.

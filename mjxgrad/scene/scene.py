@@ -1,6 +1,5 @@
 """The scene that `load_scene` returns, its description, and its sensors and sites by name."""
 
-import copy
 import dataclasses
 import difflib
 import textwrap
@@ -24,6 +23,7 @@ from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
 from mjxgrad.contact.warnings import contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
+from mjxgrad.scene.numbers import with_numbers
 from mjxgrad.scene.refusals import PARALLEL, UNDECIDED, UNLIKE, has_medium, refusal_messages
 from mjxgrad.stepping.rows import index_of
 
@@ -229,49 +229,6 @@ def changed_numbers(scene: "Scene") -> dict[str, Array]:
         return not is_known(value) or not np.array_equal(np.ravel(value), np.ravel(given).astype(value.dtype))
 
     return {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)}
-
-
-_PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "body_iquat")
-
-
-def with_numbers(mj_model: mujoco.MjModel, numbers: dict[str, Array] | dict[str, np.ndarray]) -> mujoco.MjModel:
-    """Return a copy of a C model with the numbers of an MJX model, where it has them."""
-    target = copy.deepcopy(mj_model)
-    for name, value in numbers.items():
-        is_option = name.startswith("opt.")
-        _copy_into(target.opt if is_option else target, name.removeprefix("opt."), np.asarray(value))
-    if any(not np.array_equal(getattr(target, name), getattr(mj_model, name)) for name in _PLACES):
-        _enclose(target)
-    return target
-
-
-def _enclose(target: mujoco.MjModel) -> None:
-    """Enlarge the bounding boxes by which C MuJoCo rejects pairs, around geoms that have moved or grown."""
-    turn = np.zeros(9)
-    for body, (first, count) in enumerate(zip(target.body_bvhadr, target.body_bvhnum, strict=True)):
-        mujoco.mju_quat2Mat(turn, target.body_iquat[body])
-        for node in reversed(range(first, first + count)):  # parents come before their children
-            geom, children = target.bvh_nodeid[node], first + target.bvh_child[node]
-            if geom < 0:
-                centres, halves = np.split(target.bvh_aabb[children], 2, axis=1)
-                low, high = (centres - halves).min(axis=0), (centres + halves).max(axis=0)
-                target.bvh_aabb[node] = np.concatenate([(low + high) / 2, (high - low) / 2])
-            elif (radius := target.geom_rbound[geom]) > 0:  # a plane has none
-                centre = turn.reshape(3, 3).T @ (target.geom_pos[geom] - target.body_ipos[body])
-                target.bvh_aabb[node] = np.concatenate([centre, np.full(3, radius)])
-                target.geom_aabb[geom] = np.repeat([0.0, radius], 3)
-
-
-def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
-    given = np.asarray(getattr(target, name, None))
-    if not np.issubdtype(given.dtype, np.floating):
-        return
-    if given.size != value.size:
-        raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; take one element of the batch")
-    value = value.reshape(given.shape)
-    # Numbers that differ only by float32 rounding keep the digits of the file.
-    used = np.where(value == given.astype(value.dtype), given, value)
-    setattr(target, name, used if used.ndim else float(used))
 
 
 def _heading(scene: Scene) -> str:

@@ -1,0 +1,50 @@
+"""A C model with other numbers. It needs MuJoCo alone: processes that know nothing of JAX import it."""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+_PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "body_iquat")
+
+
+def with_numbers(mj_model: mujoco.MjModel, numbers: Mapping[str, Any]) -> mujoco.MjModel:
+    """Return a copy of a C model with the numbers of an MJX model, where it has them."""
+    target = copy.deepcopy(mj_model)
+    for name, value in numbers.items():
+        is_option = name.startswith("opt.")
+        _copy_into(target.opt if is_option else target, name.removeprefix("opt."), np.asarray(value))
+    if any(not np.array_equal(getattr(target, name), getattr(mj_model, name)) for name in _PLACES):
+        _enclose(target)
+    return target
+
+
+def _enclose(target: mujoco.MjModel) -> None:
+    """Enlarge the bounding boxes by which C MuJoCo rejects pairs, around geoms that have moved or grown."""
+    turn = np.zeros(9)
+    for body, (first, count) in enumerate(zip(target.body_bvhadr, target.body_bvhnum, strict=True)):
+        mujoco.mju_quat2Mat(turn, target.body_iquat[body])
+        for node in reversed(range(first, first + count)):  # parents come before their children
+            geom, children = target.bvh_nodeid[node], first + target.bvh_child[node]
+            if geom < 0:
+                centres, halves = np.split(target.bvh_aabb[children], 2, axis=1)
+                low, high = (centres - halves).min(axis=0), (centres + halves).max(axis=0)
+                target.bvh_aabb[node] = np.concatenate([(low + high) / 2, (high - low) / 2])
+            elif (radius := target.geom_rbound[geom]) > 0:  # a plane has none
+                centre = turn.reshape(3, 3).T @ (target.geom_pos[geom] - target.body_ipos[body])
+                target.bvh_aabb[node] = np.concatenate([centre, np.full(3, radius)])
+                target.geom_aabb[geom] = np.repeat([0.0, radius], 3)
+
+
+def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
+    given = np.asarray(getattr(target, name, None))
+    if not np.issubdtype(given.dtype, np.floating):
+        return
+    if given.size != value.size:
+        raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; take one element of the batch")
+    value = value.reshape(given.shape)
+    # Numbers that differ only by float32 rounding keep the digits of the file.
+    used = np.where(value == given.astype(value.dtype), given, value)
+    setattr(target, name, used if used.ndim else float(used))
