@@ -28,8 +28,6 @@ from experiments.workspace import Workspace
 from mjxgrad._mjx import mjx
 from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
-from mjxgrad.engines import to_coordinates
-from mjxgrad.engines.mujoco import Engine
 from mjxgrad.stepping import Gradient, own_motion
 from mjxgrad.tasks import scene_path
 
@@ -186,8 +184,10 @@ _BUILDERS = {
 _DEGREE = 9
 # MuJoCo's motion and its two derivatives, by C MuJoCo and by MJX, and a motion whose contacts begin within the step.
 NATIVE = "slope, C MuJoCo"
-_BY_MUJOCO: dict[str, Gradient] = {DISCRETE: "discrete", NATIVE: "slope"}
-_ARMS = (DISCRETE, NATIVE, SLOPE, CONTINUOUS)
+_POLICY = "slope, C MuJoCo, of a policy"
+_BY_MUJOCO: dict[str, Gradient] = {DISCRETE: "discrete", NATIVE: "slope", _POLICY: "slope"}
+_ARMS = (DISCRETE, NATIVE, _POLICY, SLOPE, CONTINUOUS)
+_TOGETHER = 64  # starts whose derivatives are held at once
 _READING, _SAMPLE = ("arm", "time", "coordinate"), ("arm", "start", "time", "coordinate")
 _NUM_TIMES = 5  # at which outcomes are read, evenly over the motion
 
@@ -280,29 +280,27 @@ def _by_mujoco(
     steps_between: int,
     one: Case,
     gradient: Gradient | None,
+    *,
+    by_policy: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give readings and derivatives by C MuJoCo, which has nothing to compile; without a gradient readings alone."""
-    num, steps = len(parameters), _NUM_TIMES * steps_between
-    start = {"time": np.zeros((num, 1)), "qpos": np.tile(qpos, (num, 1)), "qvel": np.tile(qvel, (num, 1))}
-    start["act"], controls = np.zeros((num, model.na)), np.zeros((num, steps, model.nu))
-    start["qpos"][:, one.moved] += parameters
-    engine, read = Engine(model), slice(steps_between - 1, None, steps_between)
-    if gradient is None:
-        found = engine.run({}, start, {"ctrl": controls})
-        change = np.zeros((num, steps, 2 * model.nv + model.na))
-    else:
-        # The coordinate that is moved has the same number among velocities: of quaternions none is.
-        along = np.tile(np.eye(2 * model.nv + model.na)[one.moved], (num, 1))
-        found = engine.follow(gradient, {}, start, {"ctrl": controls}, (along, controls))
-        change = found["change"]
-    scene = mg.load_scene(model, engine="mujoco")
+    """Give readings and derivatives of rollouts by C MuJoCo, under controls or a policy that are zero; or readings alone."""
+    scene, steps = mg.load_scene(model, engine="mujoco"), _NUM_TIMES * steps_between
+    controls = jnp.zeros((steps, model.nu))
+    acts, horizon = ((lambda _, state: controls[0]), steps) if by_policy else (controls, None)
+    every = slice(steps_between - 1, None, steps_between)
 
-    def reading(qpos: Array, qvel: Array, change: Array) -> tuple[Array, Array]:
-        turned = to_coordinates(scene, qpos, change[: model.nv])
-        return jax.jvp(one.read, (qpos, qvel), (turned, change[model.nv : 2 * model.nv]))
+    def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
+        start = mg.initial_state(scene, jnp.asarray(qpos).at[one.moved].add(parameter), jnp.asarray(qvel))
+        course = mg.rollout(scene, start, acts, horizon=horizon, contact=own_motion(gradient or "discrete"))
+        return jax.vmap(one.read)(course.qpos[1:][every], course.qvel[1:][every])
 
-    both = jax.jit(jax.vmap(jax.vmap(reading)))(found["qpos"][:, read], found["qvel"][:, read], change[:, read])
-    return np.asarray(both[0]), np.asarray(both[1])
+    def both(parameter: Float[Array, ""]) -> tuple[Array, Array]:
+        if gradient is None:
+            return (outcome := simulate(parameter)), jnp.zeros_like(outcome)
+        return jax.jvp(simulate, (parameter,), (jnp.ones_like(parameter),))
+
+    found = jax.jit(functools.partial(jax.lax.map, both, batch_size=_TOGETHER))(jnp.asarray(parameters))
+    return np.asarray(found[0]), np.asarray(found[1])
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -336,7 +334,9 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     arms = {}
     for arm in _ARMS:
         if arm in _BY_MUJOCO:
-            outcomes, derivatives = _by_mujoco(model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm])
+            outcomes, derivatives = _by_mujoco(
+                model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm], by_policy=arm == _POLICY
+            )
         else:
             given = at_time_step(scene.model, timestep), start, jnp.asarray(parameters), jnp.int32(steps)
             outcomes, derivatives = (np.asarray(each) for each in _sample(*given, one.read, one.moved, arm))
@@ -478,7 +478,7 @@ def _teeth(course: xr.Dataset, is_first: bool, _: Outcome):
         column[0].set_title(label)
     for row, label in enumerate(("outcome less its trend", "derivative, each start", "derivative, mean")):
         axes[row, 0].set_ylabel(label)
-    handles = [Line2D([], [], color=_COLOURS[arm], marker=".", label=_NAMES[arm]) for arm in _ARMS]
+    handles = [Line2D([], [], color=_COLOURS[arm], marker=".", label=_NAMES[arm]) for arm in _COLOURS]
     handles.append(Line2D([], [], color=REFERENCE, label="slope of the simulated outcome"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
     title, duration, h = str(course.title.values), float(course.time[-1]), 1e3 * float(course.timestep)
@@ -494,7 +494,7 @@ def _draw_starts(upper: Axes, lower: Axes, one: xr.Dataset) -> None:
     """Draw one coordinate of the last reading over the start."""
     for arm in (DISCRETE, CONTINUOUS):
         upper.plot(one.start, one.residual.sel(arm=arm), color=_COLOURS[arm], lw=1.3)
-    for arm in _ARMS:
+    for arm in _COLOURS:
         lower.plot(one.start, one.derivative.sel(arm=arm), ".", color=_COLOURS[arm], ms=4)
     slope = float(one.slope.sel(arm=CONTINUOUS))
     lower.axhline(slope, color=REFERENCE, lw=1.2)
@@ -508,7 +508,7 @@ def _draw_times(axis: Axes, one: xr.Dataset) -> None:
     """Draw the slope of one coordinate and the mean of each derivative over time."""
     slope = one.slope.sel(arm=CONTINUOUS)
     axis.plot(one.time, slope, color=REFERENCE, lw=2.6)
-    for arm in _ARMS:
+    for arm in _COLOURS:
         mean, wide = one["mean"].sel(arm=arm), 2 * one.mean_error.sel(arm=arm)
         axis.plot(one.time, mean, color=_COLOURS[arm], lw=1.3)
         axis.fill_between(one.time, mean - wide, mean + wide, color=_COLOURS[arm], alpha=0.15, lw=0)

@@ -136,11 +136,14 @@ class Near:
     def is_rough(self) -> bool:
         return len(self.rough) > 0
 
-    def width(self, change: Float[np.ndarray, " nv"]) -> float:
-        """Return by how many times a displacement moves a body's farthest point a hair's breadth, across no surface."""
-        crossing = np.abs(self.gaps) / np.maximum(np.abs(self.rows @ change), _NOTHING)
-        by_turn = _LARGEST_TURN / np.abs(change).max()
-        return min(HAIR / np.max(self.lengths * np.abs(change)), by_turn, 0.9 * crossing.min(initial=np.inf))
+    def widths(self, changes: Float[np.ndarray, "some nv"]) -> Float[np.ndarray, " some"]:
+        """Return by how many times each displacement moves a body's farthest point a hair's breadth, across no surface."""
+        sizes = np.abs(changes)
+        moved = np.maximum(np.abs(changes @ self.rows.T), _NOTHING)
+        crossing = np.min(np.abs(self.gaps) / moved, axis=1, initial=np.inf)
+        return np.min(
+            [HAIR / (self.lengths * sizes).max(axis=1), _LARGEST_TURN / sizes.max(axis=1), 0.9 * crossing], axis=0
+        )
 
 
 class Surfaces:

@@ -82,7 +82,7 @@ class _Row:
         by: inverse dynamics, also of another model where rounding decides.
         clear: the state about which no small difference crosses a surface.
         near: surfaces near the state.
-        acceleration: of the step from there.
+        acceleration: the step's from there.
         begun: pairs of motions that its events begin.
         is_explicit: whether R has all that the step does.
     """
@@ -305,7 +305,7 @@ class Worker:
         directions = rest[:, moving].T
         if not len(moving):
             return
-        widths = np.array([near.width(change) for change in directions])
+        widths = near.widths(directions)
         changes = widths[:, None, None] * np.array([1.0, -1.0])[:, None] * directions[:, None]
         starts = layout.moved(one.clear, changes)
         if not one.is_explicit:

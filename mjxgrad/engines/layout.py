@@ -98,9 +98,15 @@ class Layout:
 
 def _times(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return products of quaternions."""
-    a, u, b, v = left[..., :1], left[..., 1:], right[..., :1], right[..., 1:]
-    scalar = a * b - np.sum(u * v, axis=-1, keepdims=True)
-    return np.concatenate([scalar, a * v + b * u + np.cross(u, v)], axis=-1)
+    a, b, c, d = np.moveaxis(left, -1, 0)
+    w, x, y, z = np.moveaxis(right, -1, 0)
+    parts = (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+    return np.stack(parts, axis=-1)
 
 
 def _exponential(turn: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Processes that take derivatives of a batch's pieces, where threads would wait for Python's lock.
 
 A derivative of a step is a hundred short calls of C, between which Python holds its lock: threads keep two or three cores busy.
-A process needs MuJoCo and NumPy alone, so that it starts in half a second and imports no JAX. Results are written into memory
-that all share; what a process is asked goes through a pipe, whose end is the end of the process.
+A process needs MuJoCo and NumPy alone, so that it starts in half a second and imports no JAX. Results are written into shared
+memory. Questions go through a pipe, whose end is the end of the process.
 """
 
 import atexit
@@ -93,10 +93,10 @@ class Processes:
         """Return the arrays of these shapes, whose pieces along the first axis `Engine.write` has written.
 
         Args:
-            key: of the engine, which is made where it is not known yet.
+            key: the engine's number; a process makes one where it does not know it.
             model: its C model.
             count: the length of the first axis.
-            shapes: of arrays of doubles.
+            shapes: those of the arrays, of doubles.
             arguments: function from a slice to what `Engine.write` takes beside arrays.
 
         Raises:
