@@ -7,7 +7,7 @@ Each in one process on the same work, compilation apart. Memory is what XLA sets
 - `mjx.step`: MJX as it is, its solver run to the same tolerance.
 - `mg.rollout`: our step, lean carry; on scenes with many contacts that could be, also with room for the nearest alone.
 - `mg value_and_grad`: implicit derivative, checkpointed, and not.
-- `mg.Discrete("mujoco")`: `mg.rollout` by C MuJoCo, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
+- `engine="mujoco"`: `mg.rollout` by C MuJoCo, on all cores; `C MuJoCo`: `mujoco.rollout` itself, on as many threads.
 - `MuJoCo Warp`: its step, captured as a graph on a GPU; where warp-lang is installed (`pip install warp-lang`).
 
 With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
@@ -169,7 +169,8 @@ def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
         cases[f"mg.rollout, {_ROOM[name]} contacts"] = nearest
         cases[f"mg value_and_grad, {_ROOM[name]} contacts"] = jax.value_and_grad(nearest)
     if is_cpu and len(jax.devices()) == 1:
-        cases['mg.rollout, mg.Discrete("mujoco")'] = functools.partial(ours, contact=mg.Discrete("mujoco"))
+        by_c = scene.with_engine("mujoco")
+        cases['mg.rollout, engine="mujoco"'] = functools.partial(_outcome, by_c, steps=options.steps)
     cases["mg value_and_grad"] = jax.value_and_grad(ours)
     cases["mg value_and_grad, all kept"] = jax.value_and_grad(functools.partial(ours, checkpoint=False))
     if options.forward:
@@ -343,9 +344,11 @@ def engines(
             speeds = jnp.asarray(0.3 * random.normal(size=(size, loaded.model.nv)), loaded.data.qpos.dtype)
             controls = jnp.asarray(0.1 * random.normal(size=(size, steps, loaded.model.nu)), speeds.dtype)
 
-            def cost(speeds: jax.Array, controls: jax.Array, engine: str, scene: mg.Scene = loaded) -> jax.Array:
-                start = mg.initial_state(scene, qvel=speeds)
-                return jnp.sum(mg.rollout(scene, start, controls, contact=mg.Slope(engine)).qpos[-1])
+            def cost(
+                speeds: jax.Array, controls: jax.Array, engine: mg.stepping.EngineName, scene: mg.Scene = loaded
+            ) -> jax.Array:
+                by = scene.with_engine(engine)
+                return jnp.sum(mg.rollout(by, mg.initial_state(by, qvel=speeds), controls, contact=mg.Slope()).qpos[-1])
 
             for engine in ("mujoco", "mjx"):
                 program = jax.jit(jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1))))

@@ -38,7 +38,7 @@ def rates(*, decisions: int = 50) -> None:
         scene = mg.load_scene(model)
         chosen: dict[str, Callable] = {"plain iLQR": _Plain(model, goal, weight, horizon, num_substeps)}
         for engine in ("mjx", "mujoco"):
-            system = planning.SceneSystem(scene=scene, num_substeps=num_substeps, contact=mg.Discrete(engine))  # pyright: ignore
+            system = planning.SceneSystem(scene=scene.with_engine(engine), num_substeps=num_substeps)  # pyright: ignore
             cost = planning.GoalCost(jnp.asarray(goal), weight, _TERMINAL * weight, _CONTROL)
             ours = planning.Controller(system, cost, np.zeros((horizon, model.nu)))
             chosen[f"{engine}, compiled in {ours.compile_seconds:.0f} s"] = ours

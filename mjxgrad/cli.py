@@ -166,7 +166,7 @@ def sweep(
     noise: float = 0.1,
     samples: Whole = 256,
     gradient: Literal["slope", "discrete"] = "slope",
-    engine: Literal["mjx", "mujoco"] | None = None,
+    engine: str | None = None,
     seed: Whole = 0,
     html: Path = Path("sweep.html"),
 ) -> None:
@@ -200,7 +200,8 @@ def sweep(
         log=log,
         start=start,
         horizon=horizon,
-        contact=mg.stepping.own_motion(gradient, engine),
+        contact=mg.stepping.own_motion(gradient),
+        engine=engine,
     )
     print(found, flush=True)
     write(html, found.as_html())

@@ -68,6 +68,22 @@ def test_one_file_asks_which_device():
     assert asking == {"batched/device.py"}
 
 
+def test_three_files_beside_the_engines_name_one():
+    """A further engine is a file in `engines` and a line: names are chosen in a contact's records, a scene and its loader."""
+    others = {
+        "_mjx.py",
+        "checking/check.py",
+        "envs/brax.py",
+        "tasks.py",
+    }  # a module, an argument, brax's word, a folder
+    naming = set()
+    for path in MODULES.values():
+        words = {node.value for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Constant)}
+        naming |= {path.relative_to(ROOT).as_posix()} if words & {"mjx", "mujoco"} else set()
+    naming = {name for name in naming if not name.startswith("engines/")}
+    assert naming - others == {"scene/load.py", "scene/scene.py", "stepping/contact.py"}
+
+
 def test_any_part_can_be_imported_first():
     """Python runs the packages around an imported module, too; only those that are already running it skips."""
     graph = {m: {t for t in _imported(m, only_on_loading=True) if t in MODULES} - {m} for m in MODULES}

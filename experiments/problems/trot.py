@@ -24,9 +24,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from mjxgrad import learning
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.bodies.spatial import rotation_matrix
+from mjxgrad.engines.state import data_of
 from mjxgrad.envs import Environment
 from mjxgrad.rollouts import State, initial_state
-from mjxgrad.rollouts.state import data_of
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
 

@@ -17,12 +17,14 @@ import numpy as np
 
 from mjxgrad._arrays import function, instance, real, whole
 from mjxgrad._text import Paged, format_number
+from mjxgrad.batched import device
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Line, Measured, Noise, measure
 from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
+from mjxgrad.engines import QUICK
 from mjxgrad.objective.task import as_pytree, checked_cost
 from mjxgrad.report import INK, Block, page, svg
 from mjxgrad.scene import Scene, SceneWarning, load_scene
@@ -247,7 +249,12 @@ def _noise_text(noise: Noise) -> str:
 
 def _code(scene: Scene, advice: Recommendation, path: str) -> str:
     """Return the recommendation as a program."""
-    given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
+    # On GPUs MJX is faster; elsewhere what compiles nothing.
+    given = {
+        "timestep": advice.timestep,
+        "max_contacts": advice.max_contacts,
+        "engine": QUICK if device.is_cpu() else None,
+    }
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:
         settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"

@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
-from mjxgrad.batched import device
 from mjxgrad.checking.measure import STDDEVS, Measured
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
+from mjxgrad.engines import ENGINES
+from mjxgrad.engines.state import LARGEST_GROWTH
 from mjxgrad.rollouts import rollout
-from mjxgrad.rollouts.state import LARGEST_GROWTH
 from mjxgrad.scene import Scene, SceneError, load_scene
-from mjxgrad.stepping import own_motion
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
@@ -45,9 +44,8 @@ class Finding:
 
 
 def chosen(gradient: str) -> str:
-    """Return a gradient as an argument: by C MuJoCo's engine, which compiles nothing, but on GPUs, where MJX is faster."""
-    engine = '"mujoco"' if device.is_cpu() else ""
-    return f"contact=mg.{gradient.title()}({engine})"
+    """Return a gradient as an argument."""
+    return f"contact=mg.{gradient.title()}()"
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def engine_finding(scene: Scene, motions: Motions) -> Finding:
     model.opt.ls_iterations = max(200, model.opt.ls_iterations)
     try:
         with warnings.catch_warnings(action="ignore"):
-            scene = load_scene(model, engine="mjx")
+            scene = load_scene(model, engine=next(iter(ENGINES)))
     except SceneError as error:
         return Finding("engines", f"{error}.")
     rng, whole = np.random.default_rng(0), np.flatnonzero(motions.bad_steps < 0)
@@ -150,8 +148,8 @@ def engine_finding(scene: Scene, motions: Motions) -> Finding:
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *(one.tolist() for one in at)))
     scene = eqx.tree_at(lambda s: s.model.opt.tolerance, scene, jnp.full_like(scene.model.opt.tolerance, 1e-14))
     ends = []
-    for engine in ("mjx", "mujoco"):
-        run = functools.partial(rollout, scene, contact=own_motion("discrete", engine))
+    for engine in ENGINES:
+        run = functools.partial(rollout, scene.with_engine(engine))
         found = jax.jit(jax.vmap(lambda state, control, run=run: run(state, control[None]).qvel[-1]))
         ends.append(np.asarray(found(states, motions.controls[at])))
     off = np.abs(ends[0] - ends[1]) / np.maximum(np.abs(ends[1]).max(axis=1, keepdims=True), 1)
@@ -206,7 +204,7 @@ def slope_finding(found: Sequence[Slope]) -> Finding:
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     read = [one for one in found if one.num_readings]
     parts = [f"{chosen(one.kind)}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
-    lead = f"How far the mean derivative is from the slope, typical of {found[-1].num_readings} readings."
+    lead = f"How far the mean derivative by C MuJoCo is from the slope, typical of {found[-1].num_readings} readings."
     return Finding("slope", f"{lead} {' '.join(parts)}", is_fault=_is_mostly_off(found))
 
 

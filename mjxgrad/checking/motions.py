@@ -22,10 +22,12 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from mjxgrad.batched import device
 from mjxgrad.contact import Softness
 from mjxgrad.contact.parameters import geom_name
-from mjxgrad.engines import engine_of, to_coordinates
+from mjxgrad.engines.pool import pool_of
+from mjxgrad.engines.rule import to_coordinates
+from mjxgrad.engines.state import VELOCITY_LIMIT
 from mjxgrad.objective.task import finite_cost
 from mjxgrad.rollouts import State, Trajectory
-from mjxgrad.rollouts.state import VELOCITY_LIMIT, pose_warnings
+from mjxgrad.rollouts.start import pose_warnings
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
 from mjxgrad.scene.scene import numbers_of
@@ -155,8 +157,8 @@ def run(
     numbers = {name: np.asarray(value)[None] for name, value in numbers_of(model).items()}
     numbers["opt.timestep"] = numbers["opt.timestep"] / refined
     given = numbers, {"time": np.zeros((len(controls), 1)), **start}, {"ctrl": np.repeat(controls, refined, axis=1)}
-    engine = engine_of(scene.mj_model)
-    found = engine.run(*given) if follow is None else engine.follow(follow[0], *given, follow[1])
+    pool = pool_of(scene.mj_model)
+    found = pool.run(*given) if follow is None else pool.follow(follow[0], *given, follow[1])
     path = {name: np.concatenate([start[name][:, None], found[name]], axis=1) for name in start}
     return path if follow is None else path | {"change": found["change"]}
 

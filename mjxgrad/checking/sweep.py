@@ -22,13 +22,14 @@ from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_rang
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import ESTIMATES
+from mjxgrad.engines import QUICK, engine_of
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.objective.task import SceneTask
 from mjxgrad.report import Block, Table, page, svg
 from mjxgrad.rollouts import initial_state
 from mjxgrad.scene import Scene, SceneWarning, load_scene
-from mjxgrad.stepping import Contact, Discrete, Slope
+from mjxgrad.stepping import Contact, Discrete, EngineName, Slope
 
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
@@ -111,7 +112,7 @@ def _in_pairs(objective: Any, direction: Float[Array, " nu"], keys: Key[Array, "
 def _by_mujoco(task: SceneTask) -> SceneTask:
     """Return a task whose own motion, where that is MuJoCo's, is C MuJoCo's, which compiles nothing."""
     is_own = isinstance(task.contact, Slope | Discrete)
-    return eqx.tree_at(lambda one: one.contact, task, Discrete("mujoco")) if is_own else task
+    return task.with_contact(Discrete()).with_engine(QUICK) if is_own else task
 
 
 def _thrown(task: SceneTask, along: Float[Array, " nv"], speed: Float[Array, " 1"]) -> Float[Array, ""]:
@@ -253,6 +254,7 @@ def sweep(
     num_reference: int = 4096,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
+    engine: EngineName | None = None,
     **task_settings: Any,
 ) -> Sweep:
     """Measure bias and variance of first, zeroth and α-order gradients over contact stiffness, in a scene of one's own.
@@ -267,6 +269,7 @@ def sweep(
         num_reference: rollouts for the truth.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
+        engine: who steps, see `Scene.with_engine`; by default the scene's own.
         **task_settings: `start`, a key frame; `horizon`, the number of time steps; `contact`, `mg.Slope()` by default.
 
     Raises:
@@ -281,6 +284,7 @@ def sweep(
     whole("num_samples", num_samples, 2)
     function("log", log, "text")
     scene = source if isinstance(source, Scene) else load_scene(source)
+    scene = scene if engine is None else scene.with_engine(engine)
     task = scene_task(scene, cost, seed=seed, **task_settings)
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
@@ -304,10 +308,10 @@ def sweep(
         "Swept contacts are critically damped" if scene.pairs else "No two geoms can touch, so stiffness has no effect"
     )
     question += f" {told}."
-    contact, is_c = task.contact, "mujoco" in (getattr(task.contact, "engine", None), scene.engine)
+    contact, who = task.contact, engine_of(task.scene, task.contact).title
     kinds = {"slope": "the slope of the outcome", "discrete": "that of each step"}
     kind = kinds.get(getattr(contact, "gradient", ""), f"{contact}")
-    question += f" Derivative: {kind}, by {'C MuJoCo' if is_c else 'MJX'}."
+    question += f" Derivative: {kind}, by {who}."
     shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
     if isinstance(contact, Slope) and scene.pairs and swept[-1] >= shortest:
         told = "on contacts last at most three time steps, and the slope is off, most by MJX: shorten the time step"

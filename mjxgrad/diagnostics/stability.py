@@ -25,7 +25,7 @@ from mjxgrad._text import Printed, aligned, format_number, format_range, name_pa
 from mjxgrad.contact.collision import most_contacts
 from mjxgrad.contact.law import stiffness_damping
 from mjxgrad.contact.warnings import altered_by_refsafe, beyond_stability, largest_stable_step, steepest
-from mjxgrad.rollouts.state import check_scene
+from mjxgrad.engines.state import check_scene
 from mjxgrad.scene import Scene
 
 _LEAST_FRICTION = 0.01  # of pyramids in single precision

@@ -1,7 +1,34 @@
-"""Who steps a scene: C MuJoCo behind the same calls as MJX, with derivatives: nothing to compile, any scene that MuJoCo loads."""
+"""Who steps a scene, and takes derivatives of its steps: MJX or C MuJoCo, behind the same calls."""
 
-from mjxgrad.engines.layout import INPUTS, MOTION
-from mjxgrad.engines.mujoco import engine_of
-from mjxgrad.engines.rule import linearise, product, roll_out, sense, steer, to_coordinates
+from mjxgrad.engines.engine import Engine, Motion, Observe, Policy, Rows, Sees
+from mjxgrad.engines.mjx import MJX
+from mjxgrad.engines.mujoco import MuJoCo
+from mjxgrad.engines.state import DivergedError, State, Trajectory
+from mjxgrad.scene import Scene, SceneError
+from mjxgrad.stepping import Contact, Discrete, EngineName, check_contact
 
-__all__ = ["INPUTS", "MOTION", "engine_of", "linearise", "product", "roll_out", "sense", "steer", "to_coordinates"]
+ENGINES: dict[EngineName, Engine] = {"mjx": MJX(), "mujoco": MuJoCo()}
+QUICK: EngineName = "mujoco"
+"""The engine whose first step does not wait for a compiler."""
+
+
+def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
+    """Return who steps a scene: its own engine, or MJX where that does not know such contact.
+
+    Raises:
+        ValueError: if contact is none of the four records.
+        SceneError: if MJX would have to step it, and cannot.
+    """
+    check_contact(contact)
+    engine = ENGINES[getattr(contact, "engine", None) or scene.engine]
+    if isinstance(contact, engine.contacts) and not (engine.compiles and scene.unsupported):
+        return engine
+    if scene.unsupported:
+        raise SceneError(scene.unsupported)
+    return ENGINES["mjx"]
+
+
+__all__ = [
+    "ENGINES", "QUICK", "DivergedError", "Engine", "Motion", "Observe", "Policy", "Rows", "Sees", "State", "Trajectory",
+    "engine_of",
+]  # fmt: skip

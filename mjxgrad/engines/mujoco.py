@@ -1,464 +1,212 @@
-"""C MuJoCo on all cores: batches of rollouts, and the derivatives of their steps."""
+"""C MuJoCo: on all cores of the processor, without compilation, differentiable once; any scene that MuJoCo loads."""
 
-import functools
-import itertools
-import math
-import os
-import threading
-import time
-import warnings
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
-import mujoco
-import mujoco.rollout
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int, PyTree
 
-from mjxgrad._warnings import collected
-from mjxgrad.engines.events import levers_of
-from mjxgrad.engines.flight import NUM_SLOTS, Course, Flight, fly
-from mjxgrad.engines.jacobians import Steps, Worker, solved, with_pairs
-from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
-from mjxgrad.engines.processes import are_possible, are_started, processes
-from mjxgrad.engines.stepmap import FIRST, PAIRS, advance
-from mjxgrad.scene.numbers import with_numbers
+from mjxgrad._arrays import is_known
+from mjxgrad._mjx import mjx
+from mjxgrad.bodies.kinematics import com_pos, kinematics
+from mjxgrad.engines import rule
+from mjxgrad.engines.engine import Motion, Observe, Rows, one_each
+from mjxgrad.engines.layout import INPUTS, MOTION
+from mjxgrad.engines.pool import pool_of
+from mjxgrad.engines.state import Pairs, State, Trajectory, data_of, direction, is_sound
+from mjxgrad.scene import Scene
+from mjxgrad.stepping import Contact, Discrete, Gradient, Slope
 
-START = ("time", *MOTION)
-ONCE = (*FIRST, "flight")
-"""What is found of a whole motion, not of each of its steps."""
-_NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-_NUMBERS = itertools.count()  # of engines
-# Other processes take derivatives of so many steps and more, if they take so long (s) here. Their start takes half a second.
-_FEWEST, _SHORT, _LONG = 32, 0.05, 2.0
-_MOST_NUMBERS = 2e7  # of derivatives that are held at a time, where they are not asked for
-
-_Arrays = Mapping[str, np.ndarray]
+_Inputs = dict[str, Array]
+_PLACES = (
+    "xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat",
+    "subtree_com",
+)  # fmt: skip
 
 
-@functools.lru_cache(maxsize=8)
-def engine_of(mj_model: mujoco.MjModel) -> "Engine":
-    """Return the engine of a C model; threads and memory are kept, and programs that call it are compiled once."""
-    return Engine(mj_model)
+class MuJoCo:
+    """MuJoCo itself; see `engines.engine.Engine`."""
 
+    title: ClassVar[str] = "C MuJoCo"
+    contacts: ClassVar[tuple[type, ...]] = (Discrete, Slope)
+    compiles: ClassVar[bool] = False
+    steers: ClassVar[bool] = True
 
-class Engine:
-    """A pool of threads for one C model. Arrays have the batch's axes in front, of length one where they are shared."""
+    def complete(self, scene: Scene, state: State) -> State:
+        """Return a state with histories as they are at first, and no pairs, unless it has some."""
+        pool, dtype = pool_of(scene.mj_model), state.qpos.dtype
+        first = np.concatenate([pool.first[name] for name in MOTION[3:]])
+        history = state.history if state.history.size == first.size else jnp.asarray(first, dtype)
+        nothing = [jnp.zeros(shape, dtype) for shape in (pool.flight_shape, pool.flight_shape[:1])]
+        pairs = Pairs(*nothing) if state.pairs is None else state.pairs
+        return dataclasses.replace(state, history=history, pairs=pairs)
 
-    def __init__(self, mj_model: mujoco.MjModel, *, num_threads: int = _NUM_THREADS):
-        self.mj_model, self.lock = mj_model, threading.Lock()
-        self.num_threads, self.number = num_threads, next(_NUMBERS)
-        self.pool, self.threads = mujoco.rollout.Rollout(nthread=num_threads), ThreadPoolExecutor(num_threads)
-        self.memory = [mujoco.MjData(mj_model) for _ in range(num_threads)]
-        self.start, self.layout = mujoco.MjData(mj_model), Layout(mj_model)
-        self.places = self.layout.places
-        self.plain = with_numbers(mj_model, {})
-        # A state that is not finite stays so, and is seen.
-        self.plain.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self.kept = ({}, self.plain)  # the last numbers that all of a batch shared, and their model
-        self.exact = (self.plain, solved(self.plain))  # the last of these models, and as it is differentiated
-        levers = levers_of(mj_model)
-        self.lengths = levers.max(axis=0)
-        self.workers = [Worker(self.layout, levers) for _ in range(num_threads)]
-        self.may_share = mj_model.nplugin == 0  # another process may not have its library
-        self.pace, self.spent = 0.0, 0.0  # seconds of a step's derivatives, and of all that were taken
-        self.poses = np.concatenate([mj_model.key_qpos, mj_model.qpos0[None]])
-        self.template = np.zeros(self.layout.size)
-        mujoco.mj_getState(mj_model, self.start, self.template, EVERY)
-        self.first = {name: self.template[self.places[name]] for name in MOTION}
+    def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
+        """Return the rollout under controls or a policy; the last good state is held."""
+        scene, contact, observe = motion.scene, motion.contact, motion.observe
+        given, state, seen = state, self.complete(scene, state), None
+        if motion.policy is None:
+            found, history = _course(scene, state, rows.controls + rows.noise, rows.inputs, contact.gradient)
+        else:
+            found, history, seen = _closed(motion, state, rows)
+        growth = None
+        if motion.measure_growth:
+            growth = _growth(scene, state, found.ctrl, rows.inputs, contact.gradient)
+        observations = None if observe is None else _observations(scene, state, found, history, rows.inputs, observe)
+        # What a scan carries has to look as it did.
+        final = found.final if given.pairs is not None else dataclasses.replace(found.final, pairs=None)
+        final = final if given.history.size == final.history.size else dataclasses.replace(final, history=given.history)
+        return dataclasses.replace(found, growth=growth, final=final, observations=observations, seen=seen)
 
-    def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
-        """Return positions, velocities, activations and what else goes on, after each step.
+    def linearise(
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
+    ) -> tuple[Array, Array, Array, Array]:
+        start, resting = self._arguments(scene, state)
+        inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
+        A, B, C, D = rule.linearise(scene, start, inputs, gradient=contact.gradient)
+        size = 2 * scene.model.nv + scene.model.na  # histories of delays come after
+        return A[:size, :size], B[:size], C[:, :size], D
 
-        With a warm start, "warmstart" is that of the next step after a single one, so that steps one by one are the same motion
-        to the last bit; after several it is zero.
-        """
-        with self.lock, collected():
-            batch, numbers, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
-            models = self._models(numbers, len(start["time"]))
-            rows = self._rows(start)
-            if "warmstart" in start and inputs["ctrl"].shape[1] == 1:
-                found = self._run_once(models, rows, inputs)
-            else:
-                found = self._run(models, rows, inputs)
-                found |= {"warmstart": np.zeros_like(start["warmstart"])} if "warmstart" in start else {}
-        return {name: part.reshape(*batch, *part.shape[1:]) for name, part in found.items()}
-
-    def _run_once(self, models: list[mujoco.MjModel], rows: np.ndarray, inputs: _Arrays) -> dict[str, np.ndarray]:
-        """Return the same of single steps, with warm starts, which the pool of rollouts does not give."""
-        for name, value in inputs.items():
-            rows[:, self.places[name]] = value.reshape(len(rows), -1)
-
-        def work(data: mujoco.MjData, piece: list[int]) -> None:
-            for i in piece:
-                mujoco.mj_setState(models[i], data, rows[i], EVERY)
-                mujoco.mj_step(models[i], data)
-                mujoco.mj_getState(models[i], data, rows[i], EVERY)
-
-        self._share(work, self.memory, len(rows))
-        return {name: rows[:, None, self.places[name]] for name in MOTION} | {
-            "warmstart": rows[:, self.places["warmstart"]]
-        }
-
-    def _run(self, models: list[mujoco.MjModel], rows: np.ndarray, inputs: _Arrays) -> dict[str, np.ndarray]:
-        """Return the same of many steps, by the pool of rollouts."""
-        user = rows[:, self.places["ctrl"].start : self.places["mocap_quat"].stop]
-        given = np.repeat(user[:, None], inputs["ctrl"].shape[1], axis=1)
-        for name, value in inputs.items():
-            place = self.places[name].start - self.places["ctrl"].start
-            width = math.prod(value.shape[2:])
-            given[..., place : place + width] = value.reshape(*value.shape[:2], width)
-        warm = rows[:, self.places["warmstart"]]
-        return self._motions(self._together(rows, models, given, warm))
-
-    def _together(
-        self, rows: np.ndarray, models: list[mujoco.MjModel], given: np.ndarray, warm: np.ndarray
-    ) -> np.ndarray:
-        """Return physical states after each step of several motions at once."""
-        full = np.concatenate([rows[:, self.places[name]] for name in START], axis=1)
-        return np.asarray(
-            self.pool.rollout(models, self.memory, full, given, control_spec=USER, initial_warmstart=warm)[0]
-        )
-
-    def _motions(self, found: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the parts of physical states, of which plugins come last."""
-        parts = {name: found[..., self.places[name]] for name in MOTION[:-1]}
-        return parts | {"plugin": found[..., found.shape[-1] - self.layout.sizes["plugin"] :]}
-
-    def _steps(self, rows: Float[np.ndarray, "rows size"], models: list[mujoco.MjModel]) -> np.ndarray:
-        """Return the motions after single steps of many states."""
-        user = rows[:, None, self.places["ctrl"].start : self.places["mocap_quat"].stop]
-        warm = rows[:, self.places["warmstart"]]
-        parts = self._motions(self._together(rows, models, user, warm)[:, 0])
-        return np.concatenate([parts[name] for name in MOTION], axis=-1)
-
-    def steer(
-        self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
-    ) -> dict[str, np.ndarray]:
-        """Return states and controls under a law: controls that a gain corrects by the distance from nominal states, in limits.
-
-        A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
-        """
-        with self.lock, collected():
-            batch, numbers, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
-            models = self._models(numbers, len(start["time"]))
-            nq, nv, bits = self.mj_model.nq, self.mj_model.nv, mujoco.mjtState
-            motion = bits.mjSTATE_QPOS.value | bits.mjSTATE_QVEL.value | bits.mjSTATE_ACT.value
-            found = {"states": np.zeros(law["states"].shape), "controls": np.zeros(law["controls"].shape, dtype)}
-            columns = (*(law[name] for name in ("states", "controls", "gain")), *found.values())
-            rows = self._rows(start)
-
-            @np.errstate(invalid="ignore", over="ignore")
-            def work(data: mujoco.MjData, piece: list[int]) -> None:
-                away, ctrl = np.zeros(law["gain"].shape[3]), data.ctrl
-                for i in piece:
-                    state = law["states"][i, 0]
-                    follows, lower, upper = (law[name][i] for name in ("follows", "lower", "upper"))
-                    mujoco.mj_setState(models[i], data, rows[i], EVERY)
-                    mujoco.mj_setState(models[i], data, state, motion)
-                    for nominal, control, gain, end, chosen in zip(*(x[i] for x in columns), strict=True):
-                        if follows:
-                            mujoco.mj_differentiatePos(models[i], away[:nv], 1.0, nominal[:nq], state[:nq])
-                            np.subtract(state[nq:], nominal[nq:], out=away[nv:])
-                            control = control + gain @ away
-                        np.minimum(np.maximum(control, lower), upper, out=chosen)
-                        ctrl[:] = chosen
-                        mujoco.mj_step(models[i], data, num_substeps)
-                        mujoco.mj_getState(models[i], data, end, motion)
-                        state = end
-
-            self._share(work, self.memory, len(models))
-        return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
-
-    def maps(
-        self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
-        gradient: str, wanted: tuple[str, ...],
-    ) -> dict[str, np.ndarray]:  # fmt: skip
-        """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted.
-
-        Args:
-            numbers: those of the model that differ from the file's.
-            before: states before each step, with an axis of steps as inputs have it.
-            inputs: one of each step.
-            flight: pairs in flight before the first step, packed; see `engines.flight`.
-            gradient: "discrete" or "slope".
-            wanted: names; with those of `stepmap.PAIRS` pairs of motions are followed from step to step, and "flight" has them
-                after the last.
-        """
-        with self.lock, collected():
-            ndim = np.ndim(before["time"]) - 2
-            batch, numbers, states, inputs, rest = self._flat(ndim, numbers, before, inputs, {"flight": flight})
-            # Nearly the acceleration that a solve will find.
-            states["warmstart"] = np.zeros_like(states["qvel"])
-            states["warmstart"][:, :-1] = np.diff(states["qvel"], axis=1) / self.mj_model.opt.timestep
-            num, steps = inputs["ctrl"].shape[:2]
-            flight = rest["flight"]
-            if "apart" not in wanted and all(len(x) == 1 for x in numbers.values()):  # each step is a piece of its own
-                states, inputs = (
-                    {k: x.reshape(num * steps, 1, *x.shape[2:]) for k, x in y.items()} for y in (states, inputs)
-                )
-                flight = np.zeros((num * steps, 0))
-            found = self._found(numbers, states, inputs, flight, gradient=gradient, wanted=wanted)
-        own = {name: x.shape[1:] if name in ONCE else (steps, *x.shape[2:]) for name, x in found.items()}
-        return {name: found[name].reshape(*batch, *own[name]) for name in ("state", *wanted)}
-
-    def _found(
-        self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
-        gradient: str, wanted: tuple[str, ...],
-    ) -> dict[str, np.ndarray]:  # fmt: skip
-        """Return the same of one axis of motions, by this process or, where that takes long, by several."""
-        num, steps = inputs["ctrl"].shape[:2]
-        sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()}
-        sizes |= {k: math.prod(v.shape[1:]) for k, v in numbers.items()}
-        shapes = {k: (num, *v) if k in ONCE else (num, steps, *v) for k, v in self.shapes(wanted, sizes).items()}
-
-        def arguments(piece: slice) -> tuple:
-            parts = (_part(piece, num, one) for one in (numbers, before, inputs))
-            return (*parts, flight[piece], gradient, wanted)
-
-        everything = slice(0, num)
-        if self._is_long(num * steps, lambda: arguments(slice(0, 1)), shapes):
-            try:
-                return processes(self.num_threads).share(self.number, self.mj_model, num, shapes, arguments)
-            except OSError as problem:
-                self.may_share = False
-                warnings.warn(f"derivatives are taken by one process, which is slower: {problem}", stacklevel=2)
-        found = {name: np.zeros(shape) for name, shape in shapes.items()}
-        began = time.perf_counter()
-        self.write(found, *arguments(everything))
-        self.spent += time.perf_counter() - began
-        return found
-
-    def _is_long(self, count: int, first: Callable[[], tuple], shapes: Mapping[str, tuple[int, ...]]) -> bool:
-        """Return whether several processes should take so many steps, by the time that a first one takes."""
-        if count < _FEWEST or self.num_threads < 2 or not self.may_share or not are_possible():
-            return False
-        if self.pace == 0.0:
-            numbers, before, inputs, _, gradient, _ = first()
-            before, inputs = ({k: x[:, :1] for k, x in part.items()} for part in (before, inputs))
-            found = {name: np.zeros((1, 1, *shapes[name][2:])) for name in ("state", "ctrl") if name in shapes}
-            for _ in range(2):  # a thread's first takes longer
-                began = time.perf_counter()
-                self.write(found, numbers, before, inputs, np.zeros((1, 0)), gradient, tuple(found)[1:])
-                self.pace = time.perf_counter() - began
-        foretold = count * self.pace / self.num_threads
-        return foretold > (_SHORT if are_started() else max(_SHORT, _LONG - self.spent))
-
-    def write(
-        self, found: Mapping[str, np.ndarray], numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray,
-        gradient: str, wanted: tuple[str, ...],
-    ) -> None:  # fmt: skip
-        """Write derivatives of the steps of motions into arrays of zeros."""
-        num, steps = inputs["ctrl"].shape[:2]
-        flat = {k: v.reshape(num * steps, *v.shape[2:]) for k, v in found.items() if k not in ONCE}
-        models = self._models(numbers, num)
-        work = self._work(models, before, inputs, gradient, flat)
-        self._share(lambda worker, piece: worker.fill(work, piece), self.workers, len(work.rows))
-        if "apart" not in wanted:
-            return
-        place = lambda motion, t: motion * steps + t  # noqa: E731
-        course = Course(
-            work.rows.reshape(num, steps, -1),
-            found["state"],
-            {divmod(i, steps): one for i, one in work.begun.items()},
-            lambda motion, t: work.chosen.get(place(motion, t), work.models[place(motion, t)]),
-            work.is_finite.reshape(num, steps),
-        )
-        pairs = Flight.unpacked(flight, self.layout, course.rows[:, 0])
-        fly(pairs, course, self.layout, self.lengths, models[0].opt.timestep, self._steps, found)
-        if "flight" in wanted:
-            ends = course.rows[:, -1].copy()
-            if (chosen := np.flatnonzero((pairs.widths > 0).any(axis=1))).size:
-                ends[np.ix_(chosen, self.layout.motion)] = self._steps(ends[chosen], [models[k] for k in chosen])
-            found["flight"][:] = pairs.packed(self.layout, ends)
-
-    def _work(
-        self, models: list, states: _Arrays, inputs: _Arrays, gradient: str, found: dict[str, np.ndarray]
-    ) -> Steps:
-        """Return the steps from states that have axes of motions and times."""
-        num, times = inputs["ctrl"].shape[:2]
-        rows = self._rows({k: v.reshape(num * times, *v.shape[2:]) for k, v in {**states, **inputs}.items()})
-        exact = {id(model): self._exact(model) for model in models}
-        speeds: dict[int, list] = {}
-        for model, course in zip(models, states["qvel"], strict=True):
-            speeds.setdefault(id(exact[id(model)]), []).append(course[np.isfinite(course).all(axis=1)])
-        reached = {key: np.concatenate(courses) for key, courses in speeds.items()}
-        every = [exact[id(model)] for model in models for _ in range(times)]
-        return Steps(rows, every, reached, gradient, found, np.zeros(len(rows), bool))
-
-    def sense(
-        self, numbers: _Arrays, states: _Arrays, inputs: _Arrays, *, wanted: tuple[str, ...] = ()
-    ) -> dict[str, np.ndarray]:
-        """Return the "readings" of all sensors in states, or their derivatives by "state" and what else is wanted.
-
-        States and inputs have an axis of times. Differences are small ones: sensors do not know of events.
-        """
-        with self.lock, collected():
-            batch, numbers, states, inputs = self._flat(np.ndim(states["time"]) - 2, numbers, states, inputs)
-            num, times = inputs["ctrl"].shape[:2]
-            models = self._models(numbers, num)
-            sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()} | {"state": self.layout.num_changes}
-            sizes |= {k: math.prod(v.shape[1:]) for k, v in numbers.items()}
-            count = self.mj_model.nsensordata
-            shapes = {name: (count, sizes[name]) for name in wanted} or {"readings": (count,)}
-            found = {name: np.zeros((num * times, *shape)) for name, shape in shapes.items()}
-            work = self._work(models, states, inputs, "discrete", found)
-            self._share(lambda worker, piece: worker.sense(work, piece), self.workers, num * times)
-        return {name: value.reshape(*batch, times, *value.shape[1:]) for name, value in found.items()}
+    def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
+        start, resting = self._arguments(scene, state)
+        inputs = jax.tree.map(lambda x: jnp.stack([x] * num_steps), resting | {"ctrl": ctrl})
+        found = rule.roll_out(scene, start, inputs, contact.gradient)
+        parts = {name: found[name][-1] for name in ("qpos", "qvel", "act")}
+        return dataclasses.replace(state, **parts)
 
     def product(
-        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str, wanted: tuple[str, ...]
-    ) -> dict[str, np.ndarray]:
-        """Return the derivative of the end of a motion by its start and inputs held all the time, and "end", the state there."""
-        steps = np.shape(inputs["ctrl"])[-2]
-        after = self.run(numbers, start, inputs)
-        before = self._before(start, after)
-        names = with_pairs(wanted) if gradient == "slope" and steps > 1 else wanted
-        flight = self.no_flight(np.shape(start["time"])[:-1])
-        found = self.maps(numbers, before, inputs, flight, gradient=gradient, wanted=names)
-        batch = found["state"].shape[:-3]
-        found = {name: value.reshape(-1, *value.shape[len(batch) :]) for name, value in found.items()}
-        sizes = {name: found[name].shape[-1] for name in ("state", *wanted)}
-        size, width = self.layout.num_changes, sum(sizes.values())
-        ends = []
-        for k in range(len(found["state"])):
-            one = {name: value[k] for name, value in found.items()}
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact
+    ) -> tuple[Float[Array, " state"], Float[Array, "changes both"]]:
+        """Return the state after a control was held, NaN if it is not finite, and the derivative by state and control."""
+        start, resting = self._arguments(scene, state)
+        inputs = jax.tree.map(lambda x: jnp.stack([x] * num_steps), resting | {"ctrl": ctrl})
+        found = rule.product(scene, start, inputs, gradient=contact.gradient, wanted=("ctrl",))
+        size = 2 * scene.model.nv + scene.model.na
+        matrix = jnp.concatenate([found["state"][:size, :size], found["ctrl"][:size]], axis=1)
+        return found["end"][: scene.model.nq + scene.model.nv + scene.model.na], matrix
 
-            def added(t: int, kind: str, rows: int, one: dict = one) -> np.ndarray:
-                parts = [one[f"{kind}{k}"][t] if f"{kind}{k}" in one else np.zeros((rows, sizes[k])) for k in wanted]
-                return np.concatenate([np.zeros((rows, size)), *parts], axis=-1)
+    def steer(self, scene: Scene, state: State, num_steps: int, **law: Array) -> tuple[Array, Array]:
+        """Return states and controls under a feedback law, see `engines.pool.Pool.steer`."""
+        start, resting = self._arguments(scene, state)
+        return rule.steer(scene, {"time": start["time"], **resting}, law, num_steps)
 
-            main, held, total = np.eye(size, width), np.zeros((NUM_SLOTS, width)), None
-            for t in range(steps):
-                step = {name: one[name][t] for name in ("state", *PAIRS) if name in one}
-                step["by state"] = added(t, "", size)
-                step["by felt"] = added(t, "felt ", step["felt"].shape[0]) if "felt" in step else 0.0
-                main, held, total = advance(np, main, held, step)
-            ends.append(total)
-        parts = np.split(np.reshape(ends, (*batch, size, width)), np.cumsum(list(sizes.values()))[:-1], axis=-1)
-        end = np.concatenate([after[name][..., -1, :] for name in MOTION], axis=-1)
-        is_good = np.isfinite(end).all(axis=-1, keepdims=True)
-        return dict(zip(sizes, parts, strict=True)) | {"end": np.where(is_good, end, np.nan)}
-
-    def follow(
-        self,
-        gradient: str,
-        numbers: _Arrays,
-        start: _Arrays,
-        inputs: _Arrays,
-        changes: tuple[np.ndarray, np.ndarray],
-    ) -> dict[str, np.ndarray]:
-        """Return a motion as `run` does and, as "change", what becomes of a change of the start and of the controls."""
-        after = self.run(numbers, start, inputs)
-        num, steps = after["qvel"].shape[:2]
-        size, before = self.layout.num_changes, self._before(start, after)
-        after["change"] = np.zeros((num, steps, size))
-        wanted = ("ctrl",) if changes[1].any() else ()
-        names = with_pairs(wanted) if gradient == "slope" else wanted
-        together = max(1, int(_MOST_NUMBERS / (steps * size * (2 * size + NUM_SLOTS))))
-        for first in range(0, num, together):
-            part = slice(first, first + together)
-            cut = functools.partial(_part, part, num)
-            flight = self.no_flight((len(range(num)[part]),))
-            found = self.maps(cut(numbers), cut(before), cut(inputs), flight, gradient=gradient, wanted=names)
-            for k, motion in enumerate(range(num)[part]):
-                main, held = changes[0][motion], np.zeros(NUM_SLOTS)
-                for t, push in enumerate(changes[1][motion]):
-                    one = {name: found[name][k, t] for name in ("state", *PAIRS) if name in found}
-                    one |= {"by state": found["ctrl"][k, t] @ push if wanted else 0.0, "by felt": 0.0}
-                    main, held, after["change"][motion, t] = advance(np, main, held, one)
-        return after
-
-    def no_flight(self, batch: tuple[int, ...]) -> np.ndarray:
-        """Return the room of motions without pairs in flight."""
-        return np.zeros((*batch, *self.flight_shape))
-
-    @property
-    def flight_shape(self) -> tuple[int, int]:
-        """Slots, and numbers of a pair."""
-        return NUM_SLOTS, 2 * self.layout.num_changes + 3
-
-    def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the derivatives of one step, of its end by all that is wanted.
-
-        Those of `ONCE` belong to a whole motion.
-        """
-        model, size = self.mj_model, self.layout.num_changes
-        own = {"felt": (model.nv, size), "slot": (model.nv,), "apart": (size, NUM_SLOTS), "stays": (NUM_SLOTS,)}
-        own |= {"before": (size, NUM_SLOTS), "enters": (NUM_SLOTS,), "flight": self.flight_shape}
-        own |= {k: (model.nv if k.startswith("felt") else size, sizes[k.split()[-1]]) for k in wanted if k not in own}
-        return {"state": (size, size)} | {k: own[k] for k in wanted}
-
-    def _before(self, start: _Arrays, after: _Arrays) -> dict[str, np.ndarray]:
-        """Return states before each step."""
-        found = {}
-        for name in MOTION:
-            first = np.asarray(start[name], float)[..., None, :] if name in start else self.template[self.places[name]]
-            first = np.broadcast_to(first, (*after[name].shape[:-2], 1, after[name].shape[-1]))
-            found[name] = np.concatenate([first, after[name][..., :-1, :]], axis=-2)
-        steps = after["qpos"].shape[-2]
-        found["time"] = (
-            np.asarray(start["time"], float)[..., None, :] + self.mj_model.opt.timestep * np.arange(steps)[:, None]
-        )
-        return found
-
-    def _exact(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Return a model as it is differentiated; the last is kept."""
-        if model is not self.exact[0]:
-            self.exact = (model, solved(model))
-        return self.exact[1]
-
-    def _share(self, work: Callable, workers: list, count: int) -> None:
-        """Do so many things on all threads; each takes its piece of them."""
-        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(self.num_threads, count))]
-        list(map(work, workers, pieces) if len(pieces) == 1 else self.threads.map(work, workers, pieces))
-
-    def _flat(self, ndim: int, numbers: _Arrays, *arrays: _Arrays) -> tuple:
-        """Return the batch's shape, numbers and arrays with one axis for it; that of numbers that are shared has length one."""
-        values = {name: np.asarray(value) for name, value in numbers.items()}
-        given = [{k: self._exactly(k, v) for k, v in one.items()} for one in arrays]
-        batch = np.broadcast_shapes(*(x.shape[:ndim] for one in (*given, values) for x in one.values()))
-
-        def flat(x: np.ndarray) -> np.ndarray:
-            return np.broadcast_to(x, batch + x.shape[ndim:]).reshape(math.prod(batch), *x.shape[ndim:])
-
-        flattened = {
-            k: flat(v) if math.prod(v.shape[:ndim]) > 1 else v.reshape(1, *v.shape[ndim:]) for k, v in values.items()
-        }
-        return batch, flattened, *({k: flat(v) for k, v in one.items()} for one in given)
-
-    def _models(self, numbers: _Arrays, count: int) -> list[mujoco.MjModel]:
-        """Return a model for each of so many motions, of numbers that have an axis of them, or one of length one."""
-        shared = {k: x[0] for k, x in numbers.items() if len(x) == 1}
-        content = {k: x.tobytes() for k, x in shared.items()}
-        if content != self.kept[0]:
-            self.kept = (content, with_numbers(self.plain, shared))
-        base, varied = self.kept[1], {k: x for k, x in numbers.items() if len(x) > 1}
-        if not varied:
-            return [base] * count
-        return [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(count)]
-
-    def _exactly(self, name: str, value: np.ndarray) -> np.ndarray:
-        """Return an array in double precision; positions that single precision rounded have the digits of the file again.
-
-        A body that stands on the floor in the file would else begin a nanometre above or below it.
-        """
-        given = np.asarray(value)
-        found = given.astype(float)
-        if name in ("qpos", "states") and given.dtype == np.float32:  # of a law, whose states begin with positions
-            nq = self.mj_model.nq
-            for pose in self.poses:
-                np.copyto(found[..., :nq], pose, where=given[..., :nq] == pose.astype(np.float32))
-        return found
-
-    def _rows(self, start: _Arrays) -> Float[np.ndarray, "rows size"]:
-        """Return whole states of MuJoCo, one a row, of which the start is given."""
-        rows = np.tile(self.template, (len(start["time"]), 1))
-        for name, value in start.items():
-            rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
-        return rows
+    def _arguments(self, scene: Scene, state: State) -> tuple[_Inputs, _Inputs]:
+        return _arguments(scene, self.complete(scene, state))
 
 
-def _part(part: slice, count: int, arrays: _Arrays) -> dict[str, np.ndarray]:
-    """Return some of a batch; what all share stays."""
-    return {name: value[part] if len(value) == count else value for name, value in arrays.items()}
+def _arguments(scene: Scene, state: State) -> tuple[_Inputs, _Inputs]:
+    """Return a complete state, and the scene's inputs beside controls where they are not those of its file."""
+    pool = pool_of(scene.mj_model)
+    size = pool.first["history"].size
+    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
+    start |= {"history": state.history[:size], "plugin": state.history[size:]}
+    given = {name: getattr(scene.data, name) for name in INPUTS[1:]}
+    is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(pool.start, name))  # noqa: E731
+    return start, {name: value for name, value in given.items() if value.size and not is_own(name)}
+
+
+def _closed(motion: Motion, state: State, rows: Rows) -> tuple[Trajectory, Float[Array, "states _"], PyTree]:
+    """Return the motion under a policy, step by step, what else goes on, and what the policy saw."""
+    scene, contact, policy, looks = motion.scene, motion.contact, motion.policy, motion.policy_sees == "observations"
+    assert policy is not None
+
+    def advance(carry: tuple[State, Array, Array], given: tuple[Array, Rows]) -> tuple:
+        state, first_bad, before = carry
+        index, row = given
+        seen = None
+        if looks and motion.observe is not None:
+            seen = _observed(scene, state, before, row.inputs, motion.observe)
+        ctrl = one_each(policy(motion.params, seen if looks else state), scene.model.nu) + row.noise
+        one, _ = _course(scene, state, ctrl[None], jax.tree.map(lambda x: x[None], row.inputs), contact.gradient)
+        first_bad = jnp.where((first_bad < 0) & one.diverged, index, first_bad)
+        moved = jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, one.final)
+        states = (state.qpos, state.qvel, state.act, state.history)
+        return (moved, first_bad, ctrl.astype(before.dtype)), (states, ctrl, seen)
+
+    first, steps = (state, jnp.int32(-1), scene.data.ctrl), jnp.arange(len(rows.noise), dtype=jnp.int32)
+    (final, first_bad, _), (states, ctrl, seen) = jax.lax.scan(advance, first, (steps, rows))
+    last = (final.qpos, final.qvel, final.act, final.history)
+    states = [jnp.concatenate([x, end[None]]) for x, end in zip(states, last, strict=True)]
+    return _trajectory(states, final, ctrl, first_bad), states[3], seen
+
+
+@eqx.filter_jit
+def _course(
+    scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: _Inputs, gradient: Gradient
+) -> tuple[Trajectory, Float[Array, "states _"]]:
+    """Return the motion under known controls, and what else goes on: one call of C MuJoCo."""
+    is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
+    start, resting = _arguments(scene, state)
+    assert state.pairs is not None
+    start |= {"warmstart": state.warmstart, "flight": state.pairs.flight, "held": state.pairs.held}
+    given = {name: jnp.broadcast_to(value, (len(ctrl), *value.shape)) for name, value in resting.items()}
+    found = rule.roll_out(scene, start, given | inputs | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
+    qpos, qvel, act = (jnp.concatenate([getattr(state, k)[None], found[k]]) for k in ("qpos", "qvel", "act"))
+    history = jnp.concatenate([state.history[None], jnp.concatenate([found["history"], found["plugin"]], axis=1)])
+    is_good = jax.vmap(is_sound)(qpos, qvel, act)
+    is_bad = ~(is_good[1:] & jnp.all(is_finite, axis=1))
+    first_bad = jnp.where(jnp.any(is_bad), jnp.argmax(is_bad).astype(jnp.int32), -1)
+    kept = jnp.arange(len(ctrl) + 1)
+    kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
+    qpos, qvel, act, history = (x[kept] for x in (qpos, qvel, act, history))
+    time = state.time + scene.model.opt.timestep * kept[-1]
+    pairs = Pairs(found["flight"], found["held"])
+    pairs = jax.tree.map(lambda x: jnp.where(first_bad >= 0, 0.0, x), pairs)
+    final = State(qpos[-1], qvel[-1], act[-1], time, found["warmstart"], history[-1], pairs)
+    return _trajectory((qpos, qvel, act), final, ctrl, first_bad), history
+
+
+def _trajectory(
+    states: Sequence[Array], final: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]
+) -> Trajectory:
+    qpos, qvel, act, *_ = states
+    return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act)  # pyright: ignore[reportCallIssue]
+
+
+def _growth(scene: Scene, state: State, ctrl: Array, inputs: _Inputs, gradient: Gradient) -> Float[Array, ""]:
+    """Return the growth of a tangent of the start; it has no derivative."""
+    fixed = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x  # noqa: E731
+    scene, state, ctrl, inputs = jax.tree.map(fixed, (scene, state, ctrl, inputs))
+
+    def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        found, _ = _course(scene, dataclasses.replace(state, qpos=qpos, qvel=qvel), ctrl, inputs, gradient)
+        return found.qpos, found.qvel
+
+    _, change = jax.jvp(course, (state.qpos, state.qvel), direction(state))
+    size = jnp.linalg.norm(jnp.concatenate(change, axis=1), axis=1).max()
+    return jnp.where(jnp.isfinite(size), jnp.maximum(size, 1.0), jnp.inf)
+
+
+def _observations(
+    scene: Scene, start: State, found: Trajectory, history: Float[Array, "states _"], inputs: _Inputs, observe: Observe
+) -> PyTree:
+    """Return what is observed in each state of a motion, the last one under the last control."""
+    assert found.act is not None
+    steps = jnp.minimum(jnp.arange(len(found.qpos)), len(found.ctrl) - 1)
+    time = start.time + scene.model.opt.timestep * jnp.arange(len(found.qpos))
+    states = jax.vmap(State)(found.qpos, found.qvel, found.act, time, jnp.zeros_like(found.qvel), history)
+    look = lambda state, ctrl, row: _observed(scene, state, ctrl, row, observe)  # noqa: E731
+    return jax.vmap(look)(states, found.ctrl[steps], jax.tree.map(lambda x: x[steps], inputs))
+
+
+def _observed(scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: _Inputs, observe: Observe) -> PyTree:
+    """Return what a function of model and data sees in a state under a control: sensors, and places of bodies, geoms, sites."""
+    start, resting = _arguments(scene, state)
+    given = {name: value[None] for name, value in (resting | inputs | {"ctrl": ctrl}).items()}
+    readings = rule.sense(scene, {name: value[None] for name, value in start.items()}, given)[0]
+    known = {"qpos": state.qpos, "qvel": state.qvel, "act": state.act, "ctrl": ctrl, "time": state.time, **inputs}
+    at = data_of(scene, state, ctrl).replace(**inputs)
+    placed = com_pos(scene.model, kinematics(scene.model, at))
+    known |= {name: getattr(placed, name) for name in _PLACES if hasattr(placed, name)} | {"sensordata": readings}
+
+    def unknown(value: Any) -> Any:
+        is_number = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
+        return jnp.full_like(value, jnp.nan) if is_number else value
+
+    # Forces and accelerations that only C MuJoCo has would be zeros of the template.
+    data: mjx.Data = jax.tree.map(unknown, scene.data).replace(**known)
+    return observe(scene.model.replace(sensor_needstage=scene.mj_model.sensor_needstage), data)  # pyright: ignore[reportCallIssue]

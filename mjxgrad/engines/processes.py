@@ -33,7 +33,7 @@ from mjxgrad.engines.processes import serve
 serve()
 """
 _CALLBACKS = ("act_bias", "act_dyn", "act_gain", "contactfilter", "control", "passive", "sensor")
-_MOST = 8  # engines that a process keeps
+_MOST = 8  # pools that a process keeps
 _PIECES = 4  # for each process, since some motions cost more than others
 
 
@@ -55,7 +55,7 @@ def are_possible() -> bool:
 
 
 class Processes:
-    """Processes that each hold some engines of one thread."""
+    """Processes that each hold some pools of one thread."""
 
     def __init__(self, count: int):
         root = Path(__file__).parents[1]
@@ -90,14 +90,14 @@ class Processes:
     def share(
         self, key: int, model: mujoco.MjModel, count: int, shapes: Mapping[str, tuple[int, ...]], arguments: Any
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of these shapes, whose pieces along the first axis `Engine.write` has written.
+        """Return the arrays of these shapes, whose pieces along the first axis `Pool.write` has written.
 
         Args:
-            key: the engine's number; a process makes one where it does not know it.
+            key: the pool's number; a process makes one of its own where it does not know it.
             model: its C model.
             count: the length of the first axis.
             shapes: those of the arrays, of doubles.
-            arguments: function from a slice to what `Engine.write` takes beside arrays.
+            arguments: function from a slice to what `Pool.write` takes beside arrays.
 
         Raises:
             OSError: a process has ended.
@@ -135,11 +135,11 @@ class Processes:
 
 def serve() -> None:
     """Do what the process at the other end of standard input asks for, until it ends."""
-    from mjxgrad.engines.mujoco import Engine
+    from mjxgrad.engines.pool import Pool
 
     asked, told = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed is no answer
-    engines: dict[int, Engine] = {}
+    pools: dict[int, Pool] = {}
     while True:
         try:
             key, model, (path, shapes, piece, arguments) = pickle.load(asked)
@@ -148,21 +148,21 @@ def serve() -> None:
         error = None
         try:
             if model is not None:
-                _remember(engines, key, Engine(pickle.loads(model), num_threads=1))
+                _remember(pools, key, Pool(pickle.loads(model), num_threads=1))
             with Path(path).open("r+b") as file:
                 found = _arrays(mmap.mmap(file.fileno(), 0), shapes)
-            engines[key].write({name: value[piece] for name, value in found.items()}, *arguments)
+            pools[key].write({name: value[piece] for name, value in found.items()}, *arguments)
         except Exception as problem:
             error = problem
         pickle.dump(error, told, pickle.HIGHEST_PROTOCOL)
         told.flush()
 
 
-def _remember(engines: dict, key: int, value: Any) -> None:
-    """Keep what belongs to an engine, for a few of them; both ends of a pipe forget the same."""
-    engines[key] = value
-    if len(engines) > _MOST:
-        del engines[next(iter(engines))]
+def _remember(pools: dict, key: int, value: Any) -> None:
+    """Keep what belongs to a pool, for a few of them; both ends of a pipe forget the same."""
+    pools[key] = value
+    if len(pools) > _MOST:
+        del pools[next(iter(pools))]
 
 
 @contextlib.contextmanager

@@ -24,7 +24,7 @@ from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.engines.flight import NUM_SLOTS
 from mjxgrad.engines.jacobians import with_pairs
 from mjxgrad.engines.layout import MOTION
-from mjxgrad.engines.mujoco import ONCE, Engine, engine_of
+from mjxgrad.engines.pool import ONCE, Pool, pool_of
 from mjxgrad.engines.stepmap import PAIRS, advance, begin
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
@@ -45,16 +45,16 @@ def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) 
     Returns:
         Each with one row per step; "warmstart", "flight" and "held" after the last.
     """
-    engine, dtype = engine_of(scene.mj_model), start["qpos"].dtype
+    pool, dtype = pool_of(scene.mj_model), start["qpos"].dtype
     horizon = len(inputs["ctrl"])
     shapes = {k: jax.ShapeDtypeStruct((horizon, *start[k].shape), dtype) for k in MOTION}
     shapes["warmstart"] = jax.ShapeDtypeStruct(start["qvel"].shape, dtype)
-    nothing = lambda: {"flight": jnp.zeros(engine.flight_shape, dtype), "held": jnp.zeros(NUM_SLOTS, dtype)}  # noqa: E731
+    nothing = lambda: {"flight": jnp.zeros(pool.flight_shape, dtype), "held": jnp.zeros(NUM_SLOTS, dtype)}  # noqa: E731
 
     @jax.custom_jvp
     def call(numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, Array]:
         motion = {name: start[name] for name in ("time", *MOTION, "warmstart")}
-        return _callback(engine.run, shapes, numbers, motion, inputs) | nothing()
+        return _callback(pool.run, shapes, numbers, motion, inputs) | nothing()
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
     def _derivative(primals, tangents) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -68,7 +68,7 @@ def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) 
             + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
         )
         wanted = (*with_pairs(tuple(given)), "flight") if gradient == "slope" else tuple(given)
-        maps = _maps(engine, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
+        maps = _maps(pool, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
         forced = {part: jnp.zeros(maps[part].shape[:2], dtype) for part in ("state", "felt") if part in maps}
         for part, name in itertools.product(forced, given):
             own = name if part == "state" else f"{part} {name}"
@@ -107,10 +107,10 @@ def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) 
 
 
 def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tuple[Array, Array]:
-    """Return states and controls of a feedback law in one call, see `Engine.steer`."""
-    engine, first = engine_of(scene.mj_model), law["states"][0]
+    """Return states and controls of a feedback law in one call, see `Pool.steer`."""
+    pool, first = pool_of(scene.mj_model), law["states"][0]
     shapes = {name: jax.ShapeDtypeStruct(law[name].shape, first.dtype) for name in ("states", "controls")}
-    function = functools.partial(engine.steer, num_substeps, first.dtype)
+    function = functools.partial(pool.steer, num_substeps, first.dtype)
     found = _callback(function, shapes, changed_numbers(scene), start, law)
     return jnp.concatenate([first[None], found["states"]]), found["controls"]
 
@@ -119,10 +119,10 @@ def product(
     scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]
 ) -> dict[str, Array]:
     """Return the derivative of several steps by "state" and inputs that are held, and "end", the state after them."""
-    engine = engine_of(scene.mj_model)
+    pool = pool_of(scene.mj_model)
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()}
-    shapes = engine.shapes(wanted, sizes) | {"end": (sum(start[name].size for name in MOTION),)}
-    function = functools.partial(engine.product, gradient=gradient, wanted=wanted)
+    shapes = pool.shapes(wanted, sizes) | {"end": (sum(start[name].size for name in MOTION),)}
+    function = functools.partial(pool.product, gradient=gradient, wanted=wanted)
     return _once(function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
 
 
@@ -130,27 +130,27 @@ def linearise(
     scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient
 ) -> tuple[Array, Array, Array, Array]:
     """Return the derivatives of one step and of its sensors by state and controls: A, B, C and D."""
-    engine, before = engine_of(scene.mj_model), {name: x[None] for name, x in start.items()}
-    numbers, dtype, size = changed_numbers(scene), start["qpos"].dtype, engine.layout.num_changes
-    flight = jnp.zeros(engine.flight_shape, dtype)
-    found = _maps(engine, numbers, before, inputs, flight, gradient=gradient, wanted=("ctrl",))
+    pool, before = pool_of(scene.mj_model), {name: x[None] for name, x in start.items()}
+    numbers, dtype, size = changed_numbers(scene), start["qpos"].dtype, pool.layout.num_changes
+    flight = jnp.zeros(pool.flight_shape, dtype)
+    found = _maps(pool, numbers, before, inputs, flight, gradient=gradient, wanted=("ctrl",))
     shapes = {
         "state": (1, scene.mj_model.nsensordata, size),
         "ctrl": (1, scene.mj_model.nsensordata, scene.mj_model.nu),
     }
-    sensed = _once(functools.partial(engine.sense, wanted=("state", "ctrl")), shapes, dtype, numbers, before, inputs)
+    sensed = _once(functools.partial(pool.sense, wanted=("state", "ctrl")), shapes, dtype, numbers, before, inputs)
     return found["state"][0], found["ctrl"][0], sensed["state"][0], sensed["ctrl"][0]
 
 
 def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times nsensordata"]:
     """Return the readings of all sensors in states under inputs, both with an axis of times; differentiable once."""
-    engine, dtype = engine_of(scene.mj_model), states["qpos"].dtype
+    pool, dtype = pool_of(scene.mj_model), states["qpos"].dtype
     times, count = len(inputs["ctrl"]), scene.mj_model.nsensordata
 
     @jax.custom_jvp
     def call(numbers: _Arrays, states: _Arrays, inputs: _Arrays) -> Array:
         shapes = {"readings": jax.ShapeDtypeStruct((times, count), dtype)}
-        return _callback(engine.sense, shapes, numbers, states, inputs)["readings"]
+        return _callback(pool.sense, shapes, numbers, states, inputs)["readings"]
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
     def _derivative(primals, tangents) -> tuple[Array, Array]:
@@ -162,10 +162,10 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
             for primal in (inputs, numbers)
             for name in primal
         }
-        sizes["state"] = engine.layout.num_changes
+        sizes["state"] = pool.layout.num_changes
         wanted = ("state", *given)
         shapes = {name: (times, count, sizes[name]) for name in wanted}
-        found = _once(functools.partial(engine.sense, wanted=wanted), shapes, dtype, numbers, states, inputs)
+        found = _once(functools.partial(pool.sense, wanted=wanted), shapes, dtype, numbers, states, inputs)
         zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
 
         def in_tangent_space(qpos: Array, change: Array) -> Array:
@@ -185,13 +185,13 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
 
 
 def _maps(
-    engine: Engine, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
+    pool: Pool, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
 ) -> dict[str, Array]:
-    """Return what `Engine.maps` gives of states before each step."""
+    """Return what `Pool.maps` gives of states before each step."""
     horizon = len(inputs["ctrl"])
     sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
-    shapes = {k: v if k in ONCE else (horizon, *v) for k, v in engine.shapes(how["wanted"], sizes).items()}
-    return _once(functools.partial(engine.maps, **how), shapes, before["qpos"].dtype, numbers, before, inputs, flight)
+    shapes = {k: v if k in ONCE else (horizon, *v) for k, v in pool.shapes(how["wanted"], sizes).items()}
+    return _once(functools.partial(pool.maps, **how), shapes, before["qpos"].dtype, numbers, before, inputs, flight)
 
 
 def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *arguments) -> dict[str, Array]:

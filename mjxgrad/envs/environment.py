@@ -69,7 +69,7 @@ class Environment(InScene):
     An action has one number per actuator, clipped to −1 and 1, the ends of its `ctrlrange`. It holds for `frame_skip` time
     steps. The motion is MuJoCo's own, in which policies are judged, with the derivative of its steps; ants and hoppers learn
     most with it. `with_contact(mg.Slope())` takes the derivative of the outcome, `with_contact(mg.Onset())` a continuous
-    motion, `with_contact(mg.Discrete("mujoco"))` C MuJoCo.
+    motion, and `with_engine("mujoco")` lets C MuJoCo step.
 
     Attributes:
         frame_skip: time steps per action.

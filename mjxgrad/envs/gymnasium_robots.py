@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.bodies.kinematics import kinematics
+from mjxgrad.engines.state import data_of
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
-from mjxgrad.rollouts.state import data_of
 from mjxgrad.tasks import robot_scene
 
 _ANY = (-float("inf"), float("inf"))

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from mjxgrad._arrays import function, instance, whole
 from mjxgrad._programs import compile_once
+from mjxgrad.engines import QUICK
 from mjxgrad.identification.ensemble import Ensemble, fit
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import STATES, Recording, Windows, after_start, residuals, spread, stack
@@ -98,7 +99,8 @@ def identify(
     instance("free_start", free_start, bool | None, "True, False or None")
     if contact is None:
         has_sensors = any(set(one.measured) - set(STATES) for one in (*recordings, *held_out))
-        contact = Discrete(None if has_sensors or scene.data.qpos.dtype == np.float64 else "mujoco")
+        contact = Discrete()
+        scene = scene if has_sensors or scene.data.qpos.dtype == np.float64 else scene.with_engine(QUICK)
     program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
     steps = itertools.count(1)
     end = _descend(program, program.start(), steps, max_steps, log)

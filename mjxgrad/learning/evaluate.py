@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from mjxgrad._arrays import one_key, whole
 from mjxgrad._programs import compile_once
+from mjxgrad.engines import ENGINES, QUICK
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.stepping import Discrete, Engine
+from mjxgrad.stepping import Discrete, EngineName
 
 
 class Evaluation(eqx.Module):
@@ -37,7 +38,7 @@ def evaluate(
     key: PRNGKeyArray,
     *,
     num_episodes: int,
-    engine: Engine = "mujoco",
+    engine: EngineName = QUICK,
 ) -> Evaluation:
     """Run a policy for whole episodes.
 
@@ -47,14 +48,14 @@ def evaluate(
         policy: function from an observation to an action.
         key: key of the starts; consumed here.
         num_episodes: number of episodes, at least 1.
-        engine: "mujoco" for C MuJoCo and its own contact, "mjx" for the environment's own step.
+        engine: C MuJoCo with its own contact by default; "mjx" for the environment's own step.
 
     Raises:
         ValueError: if there are no episodes, or no such engine.
     """
     num_episodes = whole("num_episodes", num_episodes)
     one_key(key)
-    judge = environment if engine == "mjx" else environment.with_contact(Discrete(engine))
+    judge = environment if ENGINES[engine].compiles else environment.with_contact(Discrete()).with_engine(engine)
 
     def one(key: PRNGKeyArray) -> Evaluation:
         start = judge.reset(key)
@@ -77,4 +78,4 @@ def evaluate(
     keys = jax.random.split(key, num_episodes)
     program = jax.jit(jax.vmap(one))
     # A program that calls C MuJoCo compiles fast and cannot be cached.
-    return program(keys) if engine == "mujoco" else compile_once(program.lower(keys))(keys)
+    return compile_once(program.lower(keys))(keys) if ENGINES[engine].compiles else program(keys)

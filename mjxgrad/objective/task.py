@@ -15,7 +15,7 @@ from mjxgrad._arrays import form, function, whole
 from mjxgrad.contact import Softness
 from mjxgrad.rollouts import Observe, Policy, Sees, State, Trajectory, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Slope, check_contact
+from mjxgrad.stepping import Contact, EngineName, Slope, check_contact
 
 
 class Outcome(eqx.Module):
@@ -89,6 +89,10 @@ class InScene(eqx.Module):
         """Return a copy whose contacts are stepped otherwise."""
         check_contact(contact)
         return dataclasses.replace(self, contact=contact)
+
+    def with_engine(self: Same, engine: EngineName) -> Same:
+        """Return a copy that this engine steps, see `Scene.with_engine`."""
+        return dataclasses.replace(self, scene=self.scene.with_engine(engine))
 
     def with_softness(self: Same, softness: Softness | None) -> Same:
         """Return a copy with other contact softness; None leaves it unchanged."""

@@ -27,7 +27,6 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from mjxgrad._arrays import is_known
 from mjxgrad._text import name_pairs
 from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System
-from mjxgrad.rollouts.arguments import native_motion
 from mjxgrad.stepping import Smoothing
 
 
@@ -84,9 +83,9 @@ class Analytic(Smoother):
         return LinearModel(*jnp.split(jnp.where(exists, jacobian, jnp.nan), [system.num_changes], axis=1))
 
     def native(self, system: System) -> SceneSystem | None:
-        """Return the system to be stepped if C MuJoCo steps it, a whole trajectory in one call; otherwise None."""
+        """Return the system to be stepped if its engine takes a whole trajectory in one call; otherwise None."""
         system = self._smoothed(system)
-        if isinstance(system, SceneSystem) and native_motion(system.scene, system.contact) is not None:
+        if isinstance(system, SceneSystem) and system.engine.steers:
             return system
 
     def _smoothed(self, system: System) -> System:

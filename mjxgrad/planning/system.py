@@ -17,13 +17,12 @@ from mjxgrad._arrays import instance, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.engines import product, roll_out, steer
+from mjxgrad.engines import Engine, engine_of
+from mjxgrad.engines.state import check_scene
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
-from mjxgrad.rollouts.arguments import arguments_of, native_motion
-from mjxgrad.rollouts.state import check_scene, data_of, state_of
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Discrete, check_contact, step
+from mjxgrad.stepping import Contact, Discrete, check_contact
 
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]
@@ -133,20 +132,19 @@ class SceneSystem(System):
         """Return a rollout's state as a vector, without time and warm start."""
         return jnp.concatenate([state.qpos, state.qvel, state.act])
 
+    @property
+    def engine(self) -> Engine:
+        """Who steps the scene, see `mjxgrad.engines`."""
+        return engine_of(self.scene, self.contact)
+
     def steer(self, **law: Array) -> tuple[Float[Array, "states state"], Float[Array, "horizon m"]]:
-        """Return C MuJoCo's states and controls under a feedback law, see `engines.mujoco.Engine.steer`."""
-        begin, resting = arguments_of(self.scene, self._unflattened(law["states"][0]))
-        return steer(self.scene, {"time": begin["time"], **resting}, law, self.num_substeps)
+        """Return states and controls under a feedback law, by an engine that steers."""
+        return self.engine.steer(self.scene, self._unflattened(law["states"][0]), self.num_substeps, **law)  # pyright: ignore
 
     def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, _Jacobian]:
-        """Return C MuJoCo's next state, NaN if it is not finite, and the derivative of its change by state and control."""
-        begin, resting = arguments_of(self.scene, self._unflattened(state))
-        inputs = jax.tree.map(lambda x: x[None], resting | {"ctrl": control})
-        inputs = jax.tree.map(lambda x: jnp.concatenate([x] * self.num_substeps), inputs)
-        found = product(self.scene, begin, inputs, gradient=self.contact.gradient, wanted=("ctrl",))  # pyright: ignore
-        size = self.num_changes
-        matrix = jnp.concatenate([found["state"][:size, :size], found["ctrl"][:size]], axis=1)
-        return found["end"][: state.size], matrix
+        """Return the next state, and the derivative of its change by state and control, by an engine that steers."""
+        given = self.scene, self._unflattened(state), control, self.num_substeps, self.contact
+        return self.engine.product(*given)  # pyright: ignore
 
     def _unflattened(self, state: StateVector) -> State:
         nq, nv = self.scene.model.nq, self.scene.model.nv
@@ -155,18 +153,8 @@ class SceneSystem(System):
 
     @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
-        start, native = self._unflattened(state), native_motion(self.scene, self.contact)
-        if native is not None:
-            begin, resting = arguments_of(self.scene, start)
-            inputs = jax.tree.map(lambda x: jnp.stack([x] * self.num_substeps), resting | {"ctrl": control})
-            found = roll_out(self.scene, begin, inputs, native.gradient)
-            return jnp.concatenate([found[name][-1] for name in ("qpos", "qvel", "act")])
-
-        def advance(now: State, _: None) -> tuple[State, None]:
-            data = data_of(self.scene, now, control)
-            return state_of(step(self.scene.model, data, contact=self.contact)), None
-
-        return self.flatten(jax.lax.scan(advance, start, None, length=self.num_substeps)[0])
+        given = self.scene, self._unflattened(state), control, self.num_substeps, self.contact
+        return self.flatten(self.engine.hold(*given))
 
     def retract(self, state: StateVector, change: ChangeVector) -> StateVector:
         nq, nv = self.scene.model.nq, self.scene.model.nv

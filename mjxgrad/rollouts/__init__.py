@@ -1,6 +1,6 @@
-"""Rollouts of a scene by MJX or C MuJoCo, with states, trajectories, linear models and rendering."""
+"""Rollouts of a scene, with initial states, linear models and rendering."""
 
-from mjxgrad.rollouts.arguments import Observe, Policy, Sees
+from mjxgrad.engines import DivergedError, Observe, Policy, Sees, State, Trajectory
 from mjxgrad.rollouts.linearisation import Linearisation, linearise
 from mjxgrad.rollouts.rollout import rollout
-from mjxgrad.rollouts.state import DivergedError, State, Trajectory, initial_state
+from mjxgrad.rollouts.start import initial_state

@@ -1,25 +1,17 @@
-"""Arguments of a rollout: types and checks."""
+"""Checks of a rollout's arguments."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike
 
-from mjxgrad._arrays import form, instance, is_known, known, real, whole
-from mjxgrad._mjx import mjx
-from mjxgrad.engines import INPUTS, engine_of
-from mjxgrad.rollouts.state import State, check_scene, complete
-from mjxgrad.scene import Scene, SceneError
-from mjxgrad.stepping import Contact, OwnMotion, check_contact
-
-Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
-"""Function from policy parameters and the state or observations to controls."""
-Observe = Callable[[mjx.Model, mjx.Data], PyTree]
-"""Function from model and data to a pytree of arrays."""
-Sees = Literal["state", "observations"]
+from mjxgrad._arrays import instance, known, real, whole
+from mjxgrad.engines import Policy, State
+from mjxgrad.engines.layout import INPUTS
+from mjxgrad.engines.state import check_scene
+from mjxgrad.scene import Scene
 
 
 def sequence_of(
@@ -77,34 +69,3 @@ def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) 
             raise ValueError(f"inputs[{name!r}] must be finite, got {numbers[~np.isfinite(numbers)][0]}")
         found[name] = jnp.asarray(value, getattr(scene.data, name).dtype)
     return found
-
-
-def native_motion(scene: Scene, contact: Contact) -> OwnMotion | None:
-    """Check how contact is stepped, and return it where C MuJoCo steps it, None where MJX does and can."""
-    check_contact(contact)
-    if isinstance(contact, OwnMotion) and (contact.engine or scene.engine) == "mujoco":
-        return contact
-    if scene.unsupported:
-        raise SceneError(scene.unsupported)
-    return None
-
-
-def arguments_of(scene: Scene, state: State) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return a state, and the scene's inputs beside controls where C MuJoCo begins with others, as `engines` takes them."""
-    state, engine = complete(scene, state), engine_of(scene.mj_model)
-    start = {"time": jnp.asarray(state.time)[None], "qpos": state.qpos, "qvel": state.qvel, "act": state.act}
-    start |= {
-        "history": state.history[: engine.first["history"].size],
-        "plugin": state.history[engine.first["history"].size :],
-    }
-    given = {name: getattr(scene.data, name) for name in INPUTS[1:]}
-    is_own = lambda name: is_known(given[name]) and np.array_equal(given[name], getattr(engine.start, name))  # noqa: E731
-    return start, {name: value for name, value in given.items() if value.size and not is_own(name)}
-
-
-def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:
-    """Refuse controls of a policy unless there is one per actuator: other shapes would silently be added or broadcast."""
-    chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen
-    if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (count,):
-        raise ValueError(f"the policy must return one control per actuator, shape ({count},), got {form(chosen)}")
-    return jnp.asarray(chosen)

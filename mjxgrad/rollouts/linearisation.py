@@ -1,16 +1,13 @@
 """A, B, C and D of one step, in the coordinates and the order of MuJoCo's `mjd_transitionFD`."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.engines import linearise as by_mujoco
-from mjxgrad.rollouts.arguments import arguments_of, check_start, native_motion, sequence_of
-from mjxgrad.rollouts.state import State, data_of
+from mjxgrad.engines import State, engine_of
+from mjxgrad.rollouts.arguments import check_start, sequence_of
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Slope, step
+from mjxgrad.stepping import Contact, Slope
 
 
 class Linearisation(eqx.Module):
@@ -45,25 +42,4 @@ def linearise(
     check_start(scene, state)
     ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
     sequence_of(ctrl[None], None, 1, scene.model.nu)
-    native = native_motion(scene, contact)
-    if native is not None:
-        start, resting = arguments_of(scene, state)
-        inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
-        A, B, C, D = by_mujoco(scene, start, inputs, gradient=native.gradient)
-        size = 2 * scene.model.nv + scene.model.na  # histories of delays come after
-        return Linearisation(A[:size, :size], B[:size], C[:, :size], D)
-    nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
-    end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
-
-    def moved(change: Float[Array, " both"]) -> tuple[Array, Array]:
-        data = data_of(scene, state, ctrl + change[size:]).replace(
-            qpos=integrate_position(scene.model, state.qpos, change[:nv], 1.0),
-            qvel=state.qvel + change[nv : 2 * nv],
-            act=state.act + change[2 * nv : size],
-        )
-        found = step(scene.model, data, contact=contact)
-        change = position_change(scene.model, end.qpos, found.qpos)
-        return jnp.concatenate([change, found.qvel, found.act]), found.sensordata
-
-    of_state, of_sensors = jax.jacfwd(moved)(jnp.zeros(size + scene.model.nu, state.qvel.dtype))
-    return Linearisation(of_state[:, :size], of_state[:, size:], of_sensors[:, :size], of_sensors[:, size:])
+    return Linearisation(*engine_of(scene, contact).linearise(scene, state, ctrl, contact))

@@ -6,7 +6,7 @@ import math
 import os
 import warnings
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ from mjxgrad.scene.conversions import (
 )
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
+from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
 _SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # known to later releases
@@ -46,7 +47,7 @@ def load_scene(
     keep_everything: bool = False,
     timestep: float | None = None,
     max_contacts: int | None = None,
-    engine: Literal["mjx", "mujoco"] | None = None,
+    engine: EngineName | None = None,
 ) -> Scene:
     """Load a scene, convert what MJX lacks and leave out what the scene does not need.
 
@@ -181,7 +182,7 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
 
 
 def _converted(
-    model: mujoco.MjModel, name: str, engine: Literal["mjx", "mujoco"] | None
+    model: mujoco.MjModel, name: str, engine: EngineName | None
 ) -> tuple[mujoco.MjModel, mujoco.MjModel, list[Conversion], str]:
     """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
     original = copy.deepcopy(model)

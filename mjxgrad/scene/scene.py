@@ -5,7 +5,7 @@ import difflib
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import get_args
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from mjxgrad.contact.warnings import contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
 from mjxgrad.scene.numbers import with_numbers
 from mjxgrad.scene.refusals import PARALLEL, UNDECIDED, UNLIKE, has_medium, refusal_messages
+from mjxgrad.stepping import EngineName
 from mjxgrad.stepping.rows import index_of
 
 _WIDTH = 118  # characters in a laptop's terminal
@@ -55,7 +56,7 @@ class Scene(eqx.Module):
         pairs: all geom pairs that can touch, in the order of `contact_parameters`; `summary` groups equal ones.
         name: source of the scene.
         unsupported: reason why MJX cannot step it, so that C MuJoCo does; empty if MJX can.
-        chosen: the engine that `with_engine` chose; empty for the default.
+        chosen: the engine that `with_engine` chose; None for the default.
     """
 
     model: mjx.Model
@@ -66,21 +67,21 @@ class Scene(eqx.Module):
     pairs: Pairs = eqx.field(static=True)
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
-    chosen: Literal["", "mjx", "mujoco"] = eqx.field(static=True, default="")
+    chosen: EngineName | None = eqx.field(static=True, default=None)
 
     @property
-    def engine(self) -> Literal["mjx", "mujoco"]:
+    def engine(self) -> EngineName:
         """Who steps it: as chosen, else "mjx", or "mujoco" where MJX lacks something."""
         return self.chosen or ("mujoco" if self.unsupported else "mjx")
 
-    def with_engine(self, engine: Literal["mjx", "mujoco"]) -> "Scene":
+    def with_engine(self, engine: EngineName) -> "Scene":
         """Return the scene stepped by MJX, or by C MuJoCo: on all cores, without compilation, differentiable once.
 
         Raises:
             ValueError: if there is no such engine.
             SceneError: if MJX cannot step the scene.
         """
-        if engine not in ("mjx", "mujoco"):
+        if engine not in get_args(EngineName):
             raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
         if engine == "mjx" and self.unsupported:
             raise SceneError(self.unsupported)

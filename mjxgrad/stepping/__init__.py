@@ -3,7 +3,7 @@
 from mjxgrad.stepping.contact import (
     Contact,
     Discrete,
-    Engine,
+    EngineName,
     Gradient,
     Onset,
     OwnMotion,

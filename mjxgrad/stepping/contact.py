@@ -11,6 +11,7 @@ All are pytrees. Lengths and widths are leaves, so a sweep over them is one `jax
 """
 
 import dataclasses
+import warnings
 from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
@@ -19,7 +20,7 @@ import jax
 from mjxgrad.stepping.onset import Onset
 from mjxgrad.stepping.smoothing import Smoothing
 
-Engine = Literal["mjx", "mujoco"]
+EngineName = Literal["mjx", "mujoco"]
 Gradient = Literal["discrete", "slope"]
 """Names of the derivatives along MuJoCo's own motion, for command lines and files; see `own_motion`."""
 
@@ -28,8 +29,7 @@ class OwnMotion(eqx.Module):
     """MuJoCo's own motion, to the bit: the common part of `Discrete` and `Slope`.
 
     Attributes:
-        engine: "mjx"; or "mujoco", C MuJoCo on all cores of the processor, without compilation, differentiable once. The
-            motions agree to the solver's tolerance. None is the scene's own, `scene.engine`.
+        engine: who steps it, in place of `scene.engine`; going, with a `FutureWarning`: take `scene.with_engine`.
     """
 
     # A plain string, so that unknown names reach the check below, which lists the choices.
@@ -37,8 +37,13 @@ class OwnMotion(eqx.Module):
     gradient: ClassVar[Gradient]
 
     def __check_init__(self):
-        if self.engine is not None and self.engine not in get_args(Engine):
+        if self.engine is not None and self.engine not in get_args(EngineName):
             raise ValueError(f'engine must be "mjx", "mujoco" or None, got {self.engine!r}')
+        if self.engine is not None:
+            told = (
+                f"contact says no longer who steps: take scene.with_engine({self.engine!r}) and {type(self).__name__}()"
+            )
+            warnings.warn(told, FutureWarning, stacklevel=4)
 
 
 class Discrete(OwnMotion):
@@ -60,15 +65,15 @@ class Slope(OwnMotion):
 Contact = Discrete | Slope | Onset | Smoothing
 
 
-def own_motion(gradient: str, engine: str | None = None) -> Discrete | Slope:
+def own_motion(gradient: str) -> Discrete | Slope:
     """Return the record of a derivative along MuJoCo's own motion, by its name.
 
     Raises:
-        ValueError: if there is no such derivative or engine.
+        ValueError: if there is no such derivative.
     """
     if gradient not in get_args(Gradient):
         raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
-    return Slope(engine) if gradient == "slope" else Discrete(engine)
+    return Slope() if gradient == "slope" else Discrete()
 
 
 def check_contact(contact: Any, *, is_step: bool = False) -> None:

@@ -287,7 +287,7 @@ def test_derivatives_along_a_line_are_those_of_a_rollout():
     def run(place, speed):
         qpos, qvel = still.qpos + 0.3 * place, speed + place * jnp.ones(1)
         start = mg.initial_state(scene, qpos=qpos, qvel=qvel)
-        course = mg.rollout(scene, start, 0.1 * place * jnp.ones((20, 1)), contact=mg.Discrete("mujoco"))
+        course = mg.rollout(scene.with_engine("mujoco"), start, 0.1 * place * jnp.ones((20, 1)))
         return jnp.stack([course.qpos[-1, 0], course.qvel[-1, 0]])
 
     for speed, derivatives in zip((-1.0, -2.0, 0.5), found.derivatives, strict=True):
@@ -297,8 +297,8 @@ def test_derivatives_along_a_line_are_those_of_a_rollout():
 def test_a_fine_motion_is_that_of_a_shorter_time_step():
     scene = mg.load_scene(ball(height=0.06), timestep=0.002 / REFINED)
     for speed, found in zip((-1.0, -2.0, 0.5), _moved("fine").outcomes, strict=True):
-        start, by_c = mg.initial_state(scene, qvel=np.array([speed])), mg.Discrete("mujoco")
-        course = mg.rollout(scene, start, horizon=20 * REFINED, contact=by_c)
+        start = mg.initial_state(scene, qvel=np.array([speed]))
+        course = mg.rollout(scene.with_engine("mujoco"), start, horizon=20 * REFINED)
         np.testing.assert_allclose(found[-1], [course.qpos[-1, 0], course.qvel[-1, 0]], rtol=1e-6)
 
 

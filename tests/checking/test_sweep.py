@@ -74,7 +74,7 @@ def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
     """By differences of the mean over common noise, a twentieth of its standard deviation to both sides."""
     scene = mg.load_scene(folder / "block.xml")
     task = scene_task(scene, f"{folder}/costs.py:reward", start="near", horizon=40, contact=mg.Discrete())
-    knob, width = Knob(task.with_contact(mg.Discrete("mujoco")), 0.5), 0.025
+    knob, width = Knob(task.with_contact(mg.Discrete()).with_engine("mujoco"), 0.5), 0.025
     keys = jax.random.split(jax.random.key(5), 2000)
     table = swept.result.table()
     for row, stiffness in enumerate(swept.result.knob[1][:2]):
@@ -135,7 +135,7 @@ def test_without_actuators_it_is_by_the_velocity_at_the_start(tmp_path):
         '<mujoco><worldbody><body name="ball"><joint type="slide" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>'
     )
     sizes = {"horizon": 50, "num_samples": 32, "num_reference": 200}
-    found = mg.sweep(tmp_path / "ball.xml", "height:ball", contact=mg.Discrete("mujoco"), **sizes)
+    found = mg.sweep(tmp_path / "ball.xml", "height:ball", contact=mg.Discrete(), engine="mujoco", **sizes)
     assert "velocity of the joint at the start" in found.question
     np.testing.assert_allclose(found.result.first.value, -0.1, rtol=1e-6)
     np.testing.assert_allclose(found.result.table()["truth"], -0.1, rtol=0.05)
@@ -169,9 +169,7 @@ def test_derivatives_by_the_push_are_those_by_all_controls_along_it(folder):
 
 def test_costs_by_name_are_what_c_mujoco_says(folder):
     scene = mg.load_scene(folder / "block.xml")
-    moved = mg.rollout(
-        scene, mg.initial_state(scene, qpos=jnp.array([0.05])), jnp.ones((20, 1)), contact=mg.Discrete("mujoco")
-    )
+    moved = mg.rollout(scene.with_engine("mujoco"), mg.initial_state(scene, qpos=jnp.array([0.05])), jnp.ones((20, 1)))
     data = mujoco.MjData(scene.mj_model)
     data.qpos[:] = moved.qpos[-1]
     mujoco.mj_kinematics(scene.mj_model, data)

@@ -10,7 +10,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.bodies.kinematics import integrate_position
-from mjxgrad.engines.mujoco import engine_of
+from mjxgrad.engines.pool import pool_of
 from mjxgrad.stepping import own_motion
 from mjxgrad.tasks import scene_path
 from tests.engines.whole_steps import by_whole_steps
@@ -97,7 +97,7 @@ def pushed():
         changed = changed.with_softness(mg.Softness(stiffness=at["stiffness"], damping_ratio=1.0))
         state = mg.initial_state(changed, qvel=at["qvel"])
         inputs = {"qfrc_applied": at["force"]}
-        course = mg.rollout(changed, state, at["ctrl"], inputs=inputs, contact=mg.Discrete(engine))
+        course = mg.rollout(changed.with_engine(engine), state, at["ctrl"], inputs=inputs)
         return jnp.concatenate([course.qpos[-1], course.qvel[-1]]) @ jnp.arange(1.0, 16.0)
 
     return at, end
@@ -142,7 +142,7 @@ def test_a_policy_is_differentiated_through_the_loop(pushed):
     def cost(gain):
         policy = lambda gain, state: 0.3 - gain * state.qvel[:1] * jnp.ones(3)  # noqa: E731
         return (
-            mg.rollout(scene, mg.initial_state(scene), policy, gain, horizon=HORIZON, contact=mg.Discrete("mujoco"))
+            mg.rollout(scene.with_engine("mujoco"), mg.initial_state(scene), policy, gain, horizon=HORIZON)
             .qpos[-1]
             .sum()
         )
@@ -158,7 +158,7 @@ def test_a_motion_that_diverges_has_finite_derivatives():
 
     def last(speed):
         state = mg.initial_state(scene, qvel=jnp.full(6, speed))
-        return mg.rollout(scene, state, horizon=5, contact=mg.Discrete("mujoco"))
+        return mg.rollout(scene.with_engine("mujoco"), state, horizon=5)
 
     course = last(2e4)  # m/s, rad/s
     assert course.diverged
@@ -182,7 +182,7 @@ def test_a_model_that_is_differentiated_is_left_as_it_was(pushed):
 def test_a_change_that_is_followed_is_the_forward_derivative(gradient, geom):
     """Step by step in one direction, against the Jacobians of all coordinates; the slope's are averages beside edges."""
     scene = mg.load_scene(SCENES["free box, pyramids"].replace('type="box"', f'type="{geom}"'))
-    engine, rng = engine_of(scene.mj_model), np.random.default_rng(5)
+    engine, rng = pool_of(scene.mj_model), np.random.default_rng(5)
     start = {
         "time": np.zeros((1, 1)),
         "qpos": scene.mj_model.qpos0[None] + [0, 0, 0.02, 0, 0, 0, 0],
@@ -196,7 +196,7 @@ def test_a_change_that_is_followed_is_the_forward_derivative(gradient, geom):
     def end(change):
         qpos = integrate_position(scene.model, jnp.asarray(start["qpos"][0]), change[:6], 1.0)
         state = mg.initial_state(scene, qpos, start["qvel"][0] + change[6:])
-        return mg.rollout(scene, state, horizon=60, contact=own_motion(gradient, "mujoco")).qvel[1:]
+        return mg.rollout(scene.with_engine("mujoco"), state, horizon=60, contact=own_motion(gradient)).qvel[1:]
 
     qvel, change = jax.jvp(end, (jnp.zeros(12),), (jnp.asarray(direction),))
     np.testing.assert_allclose(found["qvel"][0], qvel, atol=1e-9)
@@ -224,7 +224,8 @@ def test_growth_is_that_of_the_other_engine_and_has_no_derivative():
 
     def swung(torque, engine):
         controls = jnp.tile(jnp.array([torque, 0.0]), (30, 1))
-        course = mg.rollout(scene, mg.initial_state(scene), controls, contact=mg.Discrete(engine), measure_growth=True)
+        by = scene.with_engine(engine)
+        course = mg.rollout(by, mg.initial_state(by), controls, measure_growth=True)
         return course.qpos[-1, 0], (course.growth, course.explodes)
 
     differentiated = jax.jit(jax.value_and_grad(swung, has_aux=True), static_argnums=1)
@@ -246,7 +247,7 @@ def test_gaps_smaller_than_differences_do_not_multiply_derivatives():
 
     def end(qvel):
         start = mg.initial_state(scene, qvel=qvel)
-        course = mg.rollout(scene, start, horizon=50, contact=mg.Discrete("mujoco"), measure_growth=True)
+        course = mg.rollout(scene.with_engine("mujoco"), start, horizon=50, measure_growth=True)
         return course.qpos[-1], course.explodes
 
     gained, explodes = jax.jacfwd(end, has_aux=True)(jnp.array([0.3, -0.1, 0.2]))
@@ -261,7 +262,7 @@ def test_differences_do_not_step_over_a_jump_that_is_no_contact_at_the_start(gap
         <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
     scene = mg.load_scene(xml)
     start = mg.initial_state(scene, qpos=jnp.array([1e-3 + gap]), qvel=-jnp.ones(1))
-    found = mg.linearise(scene, start, contact=mg.Discrete("mujoco")).A
+    found = mg.linearise(scene.with_engine("mujoco"), start, contact=mg.Discrete()).A
     model, ends = mujoco.MjModel.from_xml_string(xml), []
     for change in (1e-8, -1e-8):
         data = mujoco.MjData(model)
@@ -277,7 +278,8 @@ def test_a_step_is_differentiated_on_its_own_side_of_a_gap_smaller_than_differen
       <body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>""")
     for gap in (1e-8, -1e-8):
         start = mg.initial_state(scene, qpos=np.array([gap]), qvel=np.array([-0.1]))
-        state, by_mjx = (mg.linearise(scene, start, contact=mg.Discrete(name)).A for name in ("mujoco", "mjx"))
+        by = (scene.with_engine(name) for name in ("mujoco", "mjx"))
+        state, by_mjx = (mg.linearise(one, start, contact=mg.Discrete()).A for one in by)
         np.testing.assert_allclose(
             state, by_mjx, atol=1e-2 * np.abs(by_mjx).max()
         )  # 4 µm from it, the impedance differs

@@ -10,7 +10,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad.diagnostics import compare_to_slope, phases
 from mjxgrad.engines.events import Surfaces, _by_modes, levers_of
-from mjxgrad.engines.mujoco import Engine
+from mjxgrad.engines.pool import Pool
 from tests.scenes import ASSETS
 
 BALL = """<mujoco><option gravity="0 0 0" timestep="{h}"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .2">
@@ -36,7 +36,7 @@ def _compared(scene, index, interval, horizon, speeds, count=32, read=3):
 
     def outcome(place):
         start = mg.initial_state(scene, scene.data.qpos.at[index].add(place), jnp.asarray(speeds))
-        course = mg.rollout(scene, start, horizon=horizon, contact=mg.Slope("mujoco"))
+        course = mg.rollout(scene.with_engine("mujoco"), start, horizon=horizon, contact=mg.Slope())
         return course.qpos[jnp.array([horizon // 2, horizon]), :read]
 
     return _to_slope(outcome, interval, count)
@@ -72,14 +72,14 @@ def test_the_mean_derivative_is_the_slope_of_the_outcome(name, xml, index, horiz
 
 
 def test_the_motion_is_the_same_to_the_last_bit():
-    scene = mg.load_scene(STICK)
+    scene = mg.load_scene(STICK, engine="mujoco")
     courses = [
         jax.jvp(
             lambda v, by=contact: mg.rollout(scene, mg.initial_state(scene, qvel=v), horizon=150, contact=by).qpos,
             (jnp.array([0.3, 0.0, 0.0]),),
             (jnp.ones(3),),
         )[0]
-        for contact in (mg.Discrete("mujoco"), mg.Slope("mujoco"))
+        for contact in (mg.Discrete(), mg.Slope())
     ]
     np.testing.assert_array_equal(*courses)
 
@@ -201,7 +201,7 @@ def test_where_contact_chatters_derivatives_are_the_slope_and_do_not_multiply():
     }
     controls = np.repeat(targets[:, None, None], steps, axis=1)
     followed = (np.zeros((129, 14)), np.ones((129, steps, 1)))
-    course = Engine(model).follow("slope", {}, start, {"ctrl": controls}, followed)
+    course = Pool(model).follow("slope", {}, start, {"ctrl": controls}, followed)
     outcomes, derivatives = course["qpos"][:, [149, -1], 0], course["change"][:, [149, -1], 0]
     found = compare_to_slope(targets, outcomes, [derivatives], ("slope",))
     assert (np.abs(found.error[0]) < 2 * found.standard_error[0] + 0.02 * found.slope).all()
@@ -255,7 +255,7 @@ def _moved_surface(scene, what):
             inputs = {what: jnp.tile(x * jnp.array([0.0, 0, 1]), (120, 1, 1))}
         else:
             inputs = {what: jnp.tile(jnp.cos(x / 2) * jnp.array([1.0, 0, 0, 0]) + jnp.sin(x / 2) * turn, (120, 1, 1))}
-        course = mg.rollout(one, start, horizon=120, contact=mg.Slope("mujoco"), inputs=inputs)
+        course = mg.rollout(one.with_engine("mujoco"), start, horizon=120, contact=mg.Slope(), inputs=inputs)
         return course.qpos[jnp.array([80, 120])][:, jnp.array([7] if what == "range" else [0, 2])]
 
     return outcome
@@ -283,12 +283,12 @@ def test_several_steps_at_once_are_those_of_a_rollout():
             thicker = scene.with_model(
                 geom_size=jnp.asarray(sizes).at[1, 0].set(radius), body_mass=scene.model.body_mass
             )
-            last = mg.rollout(thicker, start, horizon=3, contact=mg.Slope("mujoco")).final
+            last = mg.rollout(thicker.with_engine("mujoco"), start, horizon=3, contact=mg.Slope()).final
             return jnp.concatenate([last.qpos, last.qvel])
 
         state = {"time": np.zeros((1, 1)), "qpos": place[None], "qvel": speed[None]}
         how = {"gradient": "slope", "wanted": ("geom_size",)}
-        found = Engine(scene.mj_model).product({"geom_size": sizes[None]}, state, {"ctrl": np.zeros((1, 3, 0))}, **how)
+        found = Pool(scene.mj_model).product({"geom_size": sizes[None]}, state, {"ctrl": np.zeros((1, 3, 0))}, **how)
         by_speed, by_radius = jax.jacrev(course, (0, 1))(jnp.asarray(speed), jnp.asarray(sizes[1, 0]))
         np.testing.assert_allclose(found["state"][0, :, 3:], by_speed, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(found["geom_size"][0, :, 3], by_radius, rtol=1e-4, atol=1e-4)
@@ -314,7 +314,7 @@ def test_corners_that_land_together_are_taken_together(tilt, speeds):
 
     def outcome(height):
         start = mg.initial_state(scene, scene.data.qpos.at[2].add(height), jnp.array([*speeds, 0, 0, 0]))
-        return mg.rollout(scene, start, horizon=100, contact=mg.Slope("mujoco")).qpos[-1, 0]
+        return mg.rollout(scene.with_engine("mujoco"), start, horizon=100, contact=mg.Slope()).qpos[-1, 0]
 
     found = _to_slope(outcome, (0.0, 0.02), 32)
     assert abs(found.error[0]) <= 2 * found.standard_error[0] + 0.05 * abs(found.slope)
@@ -377,7 +377,7 @@ def test_rounding_decides_no_derivative():
 
     def outcome(x):
         start = mg.initial_state(scene, jnp.array([x, 0.0]), jnp.array([0.5, 0.2]))
-        return mg.rollout(scene, start, horizon=50, contact=mg.Slope("mujoco")).final.qpos
+        return mg.rollout(scene.with_engine("mujoco"), start, horizon=50, contact=mg.Slope()).final.qpos
 
     _, derivatives = jax.vmap(lambda x: jax.jvp(outcome, (x,), (1.0,)))(jnp.linspace(0, 0.1, 8))
     np.testing.assert_allclose(

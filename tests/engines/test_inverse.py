@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.engines.mujoco import Engine
+from mjxgrad.engines.pool import Pool
 from tests.engines.whole_steps import by_whole_steps
 
 ARM = """<body pos="0 0 1"><joint name="a" axis="0 1 0" {joint}/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03" mass="1"/>
@@ -43,7 +43,7 @@ def _model(integrator, joint, tendon, actuators, options):
 
 def assert_is_of_whole_steps(model, qpos, qvel, act, ctrl, **inputs):
     """A and B are differences of whole steps to 1e-6 of the largest entry, which is what these leave."""
-    engine = Engine(model)
+    engine = Pool(model)
     before = {"time": [[0.0]], "qpos": [qpos], "qvel": [qvel], "act": [act]}
     before = {name: np.array([value], float) for name, value in before.items()}
     given = {name: np.array([[value]], float) for name, value in {"ctrl": ctrl, **inputs}.items()}
@@ -91,7 +91,7 @@ def test_a_control_at_its_limit_has_the_derivative_of_its_inside():
         <motor joint="j" ctrlrange="-1 1"/><motor joint="j" ctrlrange="-1 1"/><motor joint="j" ctrlrange="-1 1"/></actuator>
         </mujoco>"""
     )
-    engine, before = Engine(model), {"time": [[[0.0]]], "qpos": [[[0.0]]], "qvel": [[[0.0]]]}
+    engine, before = Pool(model), {"time": [[[0.0]]], "qpos": [[[0.0]]], "qvel": [[[0.0]]]}
     found = engine.maps(
         {},
         before,

@@ -28,7 +28,7 @@ def test_the_motion_is_that_of_our_own_step(scene):
     random = np.random.default_rng(0)
     qvel, controls = random.normal(size=(6, scene.model.nv)), random.normal(size=(6, HORIZON, scene.model.nu))
     ours, theirs = (
-        jax.jit(jax.vmap(lambda v, u, by=mg.Discrete(engine): _rollout(scene, v, u, contact=by)))(qvel, controls)
+        jax.jit(jax.vmap(lambda v, u, engine=engine: _rollout(scene.with_engine(engine), v, u)))(qvel, controls)
         for engine in ("mjx", "mujoco")
     )
     # Both solve to the file's tolerance, which impacts amplify.
@@ -41,9 +41,7 @@ def test_the_motion_is_that_of_our_own_step(scene):
 
 def test_a_rollout_that_diverges_stays_at_its_last_good_state(scene):
     controls = jnp.zeros((HORIZON, scene.model.nu)).at[7, 0].set(jnp.nan)
-    trajectory = jax.jit(lambda u: _rollout(scene, jnp.zeros(scene.model.nv), u, contact=mg.Discrete("mujoco")))(
-        controls
-    )
+    trajectory = jax.jit(lambda u: _rollout(scene.with_engine("mujoco"), jnp.zeros(scene.model.nv), u))(controls)
     assert trajectory.diverged
     assert trajectory.first_bad_step == 7
     assert np.isfinite(trajectory.qpos).all()
@@ -57,8 +55,8 @@ def test_a_policy_is_asked_before_each_step(scene):
         return -gain * state.qvel[: scene.model.nu] + 0.3 * jnp.sin(30 * state.time)
 
     start = mg.initial_state(scene, qvel=0.1 * jnp.arange(scene.model.nv))
-    closed = mg.rollout(scene, start, policy, 0.5, horizon=HORIZON, contact=mg.Discrete("mujoco"))
-    again = mg.rollout(scene, start, closed.ctrl, contact=mg.Discrete("mujoco"))
+    closed = mg.rollout(scene.with_engine("mujoco"), start, policy, 0.5, horizon=HORIZON)
+    again = mg.rollout(scene.with_engine("mujoco"), start, closed.ctrl)
     # A solve that starts from another acceleration ends within its tolerance, not at the same bit.
     np.testing.assert_allclose(closed.qpos, again.qpos, atol=1e-7)
     assert np.ptp(closed.ctrl) > 0.1
@@ -79,11 +77,11 @@ def test_what_is_given_to_each_step_acts_alike_in_both_engines():
         "eq_active": (time < HORIZON // 2).astype(np.uint8),
     }
     ours, theirs = (
-        mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, inputs=inputs, contact=mg.Discrete(engine)).qpos
+        mg.rollout(scene.with_engine(engine), mg.initial_state(scene), horizon=HORIZON, inputs=inputs).qpos
         for engine in ("mjx", "mujoco")
     )
     np.testing.assert_allclose(theirs, ours, atol=1e-7)  # what the solves leave, and contacts multiply
-    still = mg.rollout(scene, mg.initial_state(scene), horizon=HORIZON, contact=mg.Discrete("mujoco")).qpos
+    still = mg.rollout(scene.with_engine("mujoco"), mg.initial_state(scene), horizon=HORIZON).qpos
     assert np.abs(still - theirs).max() > 1e-2
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.engines import engine_of
+from mjxgrad.engines.pool import pool_of
 from mjxgrad.envs import Environment
 
 # Both of its ends land and leave the floor again, so that pairs of motions are in flight most of the time.
@@ -125,7 +125,7 @@ def test_the_change_that_checks_follow_is_that_of_a_rollout(scene, by_array):
     qpos[:, 1] += HEIGHTS
     start = {"time": np.zeros((num, 1)), "qpos": qpos, "qvel": np.tile([0.5, 0.0, 0.0, 0.0], (num, 1))}
     changes = (np.tile(np.eye(8)[1], (num, 1)), np.zeros((num, HORIZON, 1)))
-    found = engine_of(model).follow("slope", {}, start, {"ctrl": np.zeros((num, HORIZON, 1))}, changes)
+    found = pool_of(model).follow("slope", {}, start, {"ctrl": np.zeros((num, HORIZON, 1))}, changes)
     assert_alike(found["change"][:, SKIP - 1 :: SKIP], by_array)
 
 
@@ -159,11 +159,11 @@ def test_a_delayed_actuator_keeps_its_history(way, integrator):
         start = mg.initial_state(scene)
         if way == "policy":
             policy = lambda added, state: added + 0.5 + 0.5 * state.time.reshape(1) / 0.39  # noqa: E731
-            return mg.rollout(scene, start, policy, added, horizon=40, contact=mg.Discrete("mujoco")).qpos[-1, 0]
+            return mg.rollout(scene.with_engine("mujoco"), start, policy, added, horizon=40).qpos[-1, 0]
         if way == "goes on":
-            half = mg.rollout(scene, start, controls[:20] + added, contact=mg.Discrete("mujoco"))
-            return mg.rollout(scene, half.final, controls[20:] + added, contact=mg.Discrete("mujoco")).qpos[-1, 0]
-        return mg.rollout(scene, start, controls + added, contact=mg.Discrete("mujoco")).qpos[-1, 0]
+            half = mg.rollout(scene.with_engine("mujoco"), start, controls[:20] + added)
+            return mg.rollout(scene.with_engine("mujoco"), half.final, controls[20:] + added).qpos[-1, 0]
+        return mg.rollout(scene.with_engine("mujoco"), start, controls + added).qpos[-1, 0]
 
     value, derivative = jax.value_and_grad(end)(0.0)
     np.testing.assert_allclose(value, by_mujoco(0.0), rtol=1e-9)
@@ -176,7 +176,7 @@ def test_a_start_on_the_floor_is_that_of_the_file_in_single_precision():
         """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .04"><freejoint/>
         <geom type="box" size=".04 .04 .04"/></body></worldbody></mujoco>"""
     )
-    engine, rounded = engine_of(model), model.qpos0.astype(np.float32)
+    engine, rounded = pool_of(model), model.qpos0.astype(np.float32)
     assert (rounded != model.qpos0).any()
     np.testing.assert_array_equal(engine._exactly("qpos", rounded), model.qpos0)
     moved = rounded + np.float32(1e-3)
@@ -222,7 +222,7 @@ def test_a_parameter_that_is_zero_is_not_switched_on():
     def end(gains):
         start = mg.initial_state(scene)
         changed = scene.with_model(actuator_gainprm=gains)
-        return mg.rollout(changed, start, 3 * jnp.ones((20, 1)), contact=mg.Discrete("mujoco")).qpos[-1, 0]
+        return mg.rollout(changed.with_engine("mujoco"), start, 3 * jnp.ones((20, 1))).qpos[-1, 0]
 
     gradient = np.asarray(jax.grad(end)(jnp.asarray(gains)))
     assert np.isfinite(gradient).all()

@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.rollouts import rollout
 from mjxgrad.scene import load_scene
-from mjxgrad.stepping import Discrete
 from mjxgrad.tasks import scene_path
 from tests.scenes import central_difference
 
@@ -110,7 +109,7 @@ def test_an_end_for_good_terminates_and_is_not_truncated_even_in_the_last_step(s
 
 def test_refined_an_action_takes_as_long_in_shorter_steps(cart, state):
     """Against C MuJoCo in steps of a quarter, eight of them for two, from the same state."""
-    found = jax.jit(lambda state: cart.refined(4).with_contact(Discrete("mujoco")).step(state, ACTIONS[0]))(state)
+    found = jax.jit(lambda state: cart.refined(4).with_engine("mujoco").step(state, ACTIONS[0]))(state)
     model = cart.scene.to_mujoco()
     model.opt.timestep /= 4
     data = mujoco.MjData(model)

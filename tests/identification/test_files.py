@@ -93,12 +93,14 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
 
 def test_each_number_of_a_free_joint_counts_but_a_part_of_a_quaternion():
     """Motion capture of places alone: three of six changes are compared, and the fit sees them."""
-    scene = mg.load_scene("<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>")
+    scene = mg.load_scene(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>", engine="mujoco"
+    )
     places = np.full((3, 7), np.nan)
     places[:, :3] = [[0, 0, 0], [0.1, 0.2, 0.3], [0.2, 0.4, 0.6]]
     window = stack(scene, [Recording({"qpos": places})])
     np.testing.assert_allclose(window.weight["qpos"][0], np.tile([1, 1, 1, 0, 0, 0], (3, 1)))
-    left, _ = residuals(scene, jax.tree.map(lambda x: x[0], window), None, None, contact=mg.Discrete("mujoco"))
+    left, _ = residuals(scene, jax.tree.map(lambda x: x[0], window), None, None, contact=mg.Discrete())
     np.testing.assert_allclose(left.reshape(3, 6)[1, :2], [-0.1, -0.2])
     places[:, 3] = 1.0
     with pytest.raises(ValueError, match="all four numbers of a quaternion"):

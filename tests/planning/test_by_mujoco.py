@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.engines.mujoco import Engine
+from mjxgrad.engines.pool import Pool
 from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, SceneSystem
 from mjxgrad.planning.trajectory import Course, Feedback, Problem
 
@@ -31,7 +31,7 @@ def error(request):
 
 @pytest.fixture
 def system(error):
-    return SceneSystem(scene=mg.load_scene(BOX), num_substeps=2, contact=mg.Discrete("mujoco"))
+    return SceneSystem(scene=mg.load_scene(BOX, engine="mujoco"), num_substeps=2)
 
 
 def by_steps(monkeypatch):
@@ -56,7 +56,7 @@ def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):
     for _ in range(2):
         controller(np.asarray(start))
     begin = mg.initial_state(scene, start[:nq], start[nq:])
-    found = mg.rollout(scene, begin, jnp.repeat(controller.plan.controls, 2, axis=0), contact=mg.Discrete("mujoco"))
+    found = mg.rollout(scene.with_engine("mujoco"), begin, jnp.repeat(controller.plan.controls, 2, axis=0))
     np.testing.assert_array_equal(controller.plan.states[:, :nq], found.qpos[::2])
     np.testing.assert_array_equal(controller.plan.states[:, nq:], found.qvel[::2])
     assert np.abs(controller.plan.controls).min() > 1e-3
@@ -67,7 +67,7 @@ def test_an_iteration_asks_c_mujoco_twice(monkeypatch, system):
     """Once for all linear models, and once for all step lengths; a call for each step would be seen."""
     counts = collections.Counter()
     for name in ("steer", "product", "follow"):
-        monkeypatch.setattr(Engine, name, _counted(counts, name))
+        monkeypatch.setattr(Pool, name, _counted(counts, name))
     controller, state = controller_of(system), np.asarray(start_of(system))
     controller(state)
     counts.clear()
@@ -76,7 +76,7 @@ def test_an_iteration_asks_c_mujoco_twice(monkeypatch, system):
 
 
 def _counted(counts, name):
-    function = getattr(Engine, name)
+    function = getattr(Pool, name)
 
     def call(*given, **settings):
         counts[name] += 1
@@ -125,7 +125,7 @@ def test_a_law_turns_a_free_body_as_single_steps_do(error, system, monkeypatch):
 
 @pytest.mark.parametrize("gradient", [mg.Discrete, mg.Slope])
 def test_linear_models_are_those_of_single_steps(error, system, monkeypatch, gradient):
-    system = dataclasses.replace(system, contact=gradient("mujoco"))
+    system = dataclasses.replace(system, contact=gradient())
     given = (start_of(system), jnp.array([0.3, -0.2]), None)
     found = jax.jit(functools.partial(Exact().linear_model, system))(*given)
     by_steps(monkeypatch)

@@ -102,7 +102,9 @@ def test_a_scene_is_planned_by_c_mujoco_as_by_mjx(gradient):
     """A ball on a spring, two steps: the end, and its linear model up to the rounding of C's differences."""
     ball = "<worldbody><body><joint type='slide' name='x' stiffness='50'/><geom size='.1'/></body></worldbody>"
     scene = mg.load_scene(f"<mujoco>{ball}<actuator><motor joint='x'/></actuator></mujoco>")
-    systems = [SceneSystem(scene=scene, num_substeps=2, contact=gradient(name)) for name in ("mujoco", "mjx")]
+    systems = [
+        SceneSystem(scene=scene.with_engine(name), num_substeps=2, contact=gradient()) for name in ("mujoco", "mjx")
+    ]
     given = (jnp.array([0.1, 1.0]), jnp.array([0.5]), jax.random.key(0))
     models = [jax.jit(lambda s=s: Exact().linear_model(s, *given))() for s in systems]
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5), *models)

@@ -311,7 +311,7 @@ _FOOT = """
 
 def test_a_light_foot_that_a_strong_motor_presses_down_does_not_chatter():
     """It rocks from heel to toe. With widths by gravity alone derivatives are up to 60 times the slope, their mean twice it."""
-    scene = mg.load_scene(_FOOT)
+    scene = mg.load_scene(_FOOT).with_engine("mujoco")
     time = 4e-3 * jnp.arange(75)
 
     def turning(place, contact):
@@ -323,7 +323,7 @@ def test_a_light_foot_that_a_strong_motor_presses_down_does_not_chatter():
 
     places = jnp.linspace(-1, 1, 128)
     values, derivatives = jax.jit(jax.vmap(jax.value_and_grad(lambda x: turning(x, mg.Onset()))))(places)
-    mujocos = jax.jit(jax.vmap(lambda x: turning(x, mg.Discrete("mujoco"))))(places)
+    mujocos = jax.jit(jax.vmap(lambda x: turning(x, mg.Discrete())))(places)
     slope = (values[-1] - values[0]) / 2
     assert np.abs(derivatives).max() < 15 * np.abs(slope)
     assert np.abs(derivatives.mean() - slope) < 3 * derivatives.std() / np.sqrt(128)

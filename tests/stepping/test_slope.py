@@ -37,8 +37,8 @@ def _forward(function):
 def test_the_mean_derivative_of_a_bounce_is_its_slope_and_the_motion_is_mujocos(limit, contact, transform):
     """-e⁻², nearly: contact at the critical damping leaves e⁻² of the speed."""
     scene = mg.load_scene(BALL.format(limit=limit, contact=contact))
-    outcomes, derivatives = _ends(scene, mg.Slope("mjx"), transform)
-    own, discrete = _ends(scene, mg.Discrete("mjx"), _forward)
+    outcomes, derivatives = _ends(scene, mg.Slope(), transform)
+    own, discrete = _ends(scene, mg.Discrete(), _forward)
     np.testing.assert_array_equal(outcomes, own)
     found = compare_to_slope(PLACES, outcomes, [derivatives, discrete], ("slope", "discrete"))
     np.testing.assert_allclose(found.mean[0], found.slope, atol=0.02)
