@@ -30,6 +30,7 @@ _NOTHING = 1e-9  # of a displacement by one
 # Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
 _STEEP, _NARROWER = 10.0, 1 / 30
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
+_APART = 0.5  # of the larger side's difference, by which the two sides differ where one has a jump
 _OF_TIME = "opt.timestep"
 _KINK = 0.1  # of a derivative, by which its two sides differ at most
 _TOGETHER = 64  # rows whose algebra is done at once
@@ -323,29 +324,46 @@ class Worker:
         found[layout.nv : 2 * layout.nv, moving] = change
 
     def _by_steps(self, one: _Row) -> None:
-        """Write differences of whole steps; narrower ones, where these step over a jump."""
+        """Write differences of whole steps by state and controls."""
         width = _WIDTH if one.near is None or not one.near.is_rough or self.surfaces.lead else _RUBBING
-        self._subtract(one, one.found, width)
-        if self._steepness(one.found["state"]) > _STEEP / self.model.opt.timestep:
-            narrow = {name: one.found[name].copy() for name in ("state", "ctrl") if name in one.found}
-            self._subtract(one, narrow, _NARROWER * width)
-            if self._steepness(narrow["state"]) < 0.5 * self._steepness(one.found["state"]):
-                for name, value in narrow.items():
-                    one.found[name][:] = value
-
-    def _subtract(self, one: _Row, found: _Found, width: float) -> None:
-        """Write differences of whole steps of this width by state and controls."""
         layout = self.layout
-        changes = width * np.eye(layout.num_changes)
-        starts = np.stack([layout.moved(one.clear, side * changes) for side in (1, -1)], axis=1)
-        found["state"][:] = self._between(one, starts, np.full(len(starts), 2 * width)).T
-        if "ctrl" in found:
+        one.found["state"][:] = self._smooth(one, np.eye(layout.num_changes), width).T
+        if "ctrl" in one.found:
             place = layout.places["ctrl"]
             entries = np.arange(place.start, place.stop)
             up, down, size = one.by.sides(one.clear[entries], width)
             starts = np.tile(one.clear, (len(entries), 2, 1))
             starts[np.arange(len(entries)), :, entries] = np.stack([up, down], axis=1)
-            found["ctrl"][:] = self._between(one, starts, size).T
+            one.found["ctrl"][:] = self._between(one, starts, size).T
+
+    def _smooth(self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float) -> np.ndarray:
+        """Return differences along directions, over one side where the other has a jump, and narrower where both have.
+
+        A stage of Runge-Kutta may meet a surface that the start is far from.
+        """
+        middle = one.after if one.clear is one.before else self._step(one.by, one.clear)
+        found, sizes, had_jump = (
+            np.zeros_like(directions),
+            np.full(len(directions), np.inf),
+            np.zeros(len(directions), bool),
+        )
+        left, signs = np.arange(len(directions)), np.array([1.0, -1.0])
+        for narrower in (1.0, _NARROWER, _NARROWER**2):
+            starts = self.layout.moved(one.clear, narrower * width * signs[:, None] * directions[left, None])
+            ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
+            sides = self.layout.difference(ends, middle) * signs[:, None] / (narrower * width)
+            both, size = np.linalg.norm(sides, axis=2), np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1)
+            jumps = (size > _APART * both.max(axis=1)) & (both.max(axis=1) > 1 / self.model.opt.timestep)
+            least = np.take_along_axis(sides, both.argmin(axis=1)[:, None, None], axis=1)[:, 0]
+            chosen = np.where(jumps[:, None], least, sides.mean(axis=1))
+            size = np.linalg.norm(chosen, axis=1)
+            is_better = (size < 0.5 * sizes[left]) | (had_jump[left] & ~jumps)
+            index = left[is_better]
+            found[index], sizes[index], had_jump[index] = chosen[is_better], size[is_better], jumps[is_better]
+            left = left[jumps | (size > 1 / self.model.opt.timestep)]
+            if not left.size:
+                break
+        return found
 
     def _between(self, one: _Row, starts: Float[np.ndarray, "columns 2 size"], widths: np.ndarray) -> np.ndarray:
         """Return differences of the ends of steps over their widths, a row each."""

@@ -255,11 +255,16 @@ def test_gaps_smaller_than_differences_do_not_multiply_derivatives():
     assert 0 < gained[0, 0] < 1
 
 
-@pytest.mark.parametrize("gap", [3e-7, -3e-7])
-def test_differences_do_not_step_over_a_jump_that_is_no_contact_at_the_start(gap):
-    """Half a step of a fall at 1 m/s takes a stage of Runge-Kutta to a floor 1 mm below; differences of 1 µm have -3e4."""
-    xml = """<mujoco><option integrator="RK4"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .1">
-        <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+@pytest.mark.parametrize(("gap", "other", "softness"), [(3e-7, 1.0, 0.02), (-3e-7, 1.0, 0.02), (3e-7, -6e-7, 0.4)])
+def test_differences_do_not_step_over_a_jump_that_is_no_contact_at_the_start(gap, other, softness):
+    """Half a step of a fall at 1 m/s takes a stage of Runge-Kutta to a floor 1 mm below; differences of 1 µm have -3e4.
+
+    With a second ball that begins to touch on the other side both sides have a jump.
+    """
+    xml = f"""<mujoco><option integrator="RK4"/><default><geom solref="{softness} 1"/></default><worldbody>
+        <geom type="plane" size="1 1 .1"/><body pos="0 0 .1">
+        <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/><geom pos="1 0 {other}" size=".1" mass="1"/></body>
+        </worldbody></mujoco>"""
     scene = mg.load_scene(xml)
     start = mg.initial_state(scene, qpos=jnp.array([1e-3 + gap]), qvel=-jnp.ones(1))
     found = mg.linearise(scene.with_engine("mujoco"), start, contact=mg.Discrete()).A
