@@ -184,9 +184,9 @@ _BUILDERS = {
 _DEGREE = 9
 # MuJoCo's motion and its two derivatives, by C MuJoCo and by MJX, and a motion whose contacts begin within the step.
 NATIVE = "slope, C MuJoCo"
-_POLICY = "slope, C MuJoCo, of a policy"
-_BY_MUJOCO: dict[str, Gradient] = {DISCRETE: "discrete", NATIVE: "slope", _POLICY: "slope"}
-_ARMS = (DISCRETE, NATIVE, _POLICY, SLOPE, CONTINUOUS)
+POLICY = "slope, C MuJoCo, of a policy"
+_BY_MUJOCO: dict[str, Gradient] = {DISCRETE: "discrete", NATIVE: "slope", POLICY: "slope"}
+_ARMS = (DISCRETE, NATIVE, POLICY, SLOPE, CONTINUOUS)
 _TOGETHER = 64  # starts whose derivatives are held at once
 _READING, _SAMPLE = ("arm", "time", "coordinate"), ("arm", "start", "time", "coordinate")
 _NUM_TIMES = 5  # at which outcomes are read, evenly over the motion
@@ -335,7 +335,7 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     for arm in _ARMS:
         if arm in _BY_MUJOCO:
             outcomes, derivatives = _by_mujoco(
-                model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm], by_policy=arm == _POLICY
+                model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm], by_policy=arm == POLICY
             )
         else:
             given = at_time_step(scene.model, timestep), start, jnp.asarray(parameters), jnp.int32(steps)

@@ -24,8 +24,6 @@ state = mg.initial_state(scene)
 balls = mg.load_scene("<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/><geom name='lamp' size='.1' contype='0' "
                       "conaffinity='0'/><body><freejoint name='root'/><geom name='ball' size='.1'/></body><body pos='1 0 1'>"
                       "<freejoint/><geom name='other' size='.1'/></body></worldbody></mujoco>")
-sleeping = ("<mujoco><option><flag sleep='enable'/></option><worldbody><body><freejoint/><geom size='.1'/></body></worldbody>"
-            "</mujoco>")
 still = mg.initial_state(balls, qpos=balls.data.qpos.at[2].set(1.0))
 archive = tempfile.mkdtemp() + "/run.npy"
 np.save(archive, np.zeros(3))
@@ -203,7 +201,6 @@ FOUND = {
     "jax.vmap(balls.with_softness)(mg.Softness(stiffness=[1e2, 1e3], damping_ratio=[1, 1])).summary()":
         "one scene with known values",
     "mg.load_scene('<mujoco><worldbody><geom size=\".1\"/></worldbody></mujoco>')": "got none (nv = 0)",
-    "mg.load_scene(sleeping)": "must not let bodies sleep: what sleeps is no part of a state",
     "scene.with_model(dof_dampng=jnp.ones(1))": "numbers of the MJX model, got dof_dampng; did you mean dof_damping",
     "scene.with_model(geom_type=jnp.ones(1))": "must name arrays of numbers of the MJX model, got geom_type",
     "scene.with_model(dof_damping=5.0)": "dof_damping must have shape (1,) in this scene, got ()",

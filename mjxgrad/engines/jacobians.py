@@ -341,7 +341,8 @@ class Worker:
 
         A stage of Runge-Kutta may meet a surface that the start is far from.
         """
-        middle = one.after if one.clear is one.before else self._step(one.by, one.clear)
+        is_own = one.clear is one.before and one.by is self.inverse
+        middle = one.after if is_own else self._step(one.by, one.clear)
         found, sizes, had_jump = (
             np.zeros_like(directions),
             np.full(len(directions), np.inf),

@@ -43,16 +43,23 @@ class Conversion:
     exact: bool = True
 
 
+def waking(model: mujoco.MjModel) -> Iterator[Conversion]:
+    """Let no body sleep, by either engine: what sleeps is no part of a state, from which a rollout goes on."""
+    if model.opt.enableflags & _ENABLE.mjENBL_SLEEP.value:
+        model.opt.enableflags &= ~_ENABLE.mjENBL_SLEEP.value
+        yield Conversion("flag sleep", "enable", "disable", "bodies at rest are stepped too, not frozen", exact=False)
+
+
 def _flags(model: mujoco.MjModel) -> Iterator[Conversion]:
-    for flag, reason, exact in (
-        (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only", True),
-        (_ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing", True),
-        (_ENABLE.mjENBL_SLEEP, "bodies at rest are stepped too, not frozen as in C MuJoCo", False),
+    for flag, reason in (
+        (_ENABLE.mjENBL_ENERGY, "energy is computed for reading only"),
+        (_ENABLE.mjENBL_FWDINV, "compares forward and inverse dynamics, moves nothing"),
     ):
         if model.opt.enableflags & flag.value:
             model.opt.enableflags &= ~flag.value
             what = f"flag {flag.name.removeprefix('mjENBL_').lower()}"
-            yield Conversion(what, "enable", "disable", reason, exact)
+            yield Conversion(what, "enable", "disable", reason)
+    yield from waking(model)
     for flag in ("ISLAND", "MIDPHASE", "NATIVECCD", "MULTICCD", "AUTORESET"):
         if model.opt.disableflags & getattr(_DISABLE, f"mjDSBL_{flag}").value:
             reason = "chooses between algorithms of C MuJoCo; MJX has its own"

@@ -28,13 +28,13 @@ from mjxgrad.scene.conversions import (
     drop_sensors,
     kinematics_alone,
     switch_off,
+    waking,
 )
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
-_SLEEP = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))  # known to later releases
 MOST_PAIRS = 20_000
 """Largest number of geom pairs; loading more takes minutes and is refused."""
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
@@ -176,9 +176,6 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
     if model.nv == 0:
         reason = "so that nothing can move; give a body a joint"
         raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
-    if model.opt.enableflags & _SLEEP:
-        reason = "what sleeps is no part of a state, from which a rollout goes on"
-        raise SceneError(f"{name} must not let bodies sleep: {reason}; leave out <flag sleep='enable'/>")
 
 
 def _converted(
@@ -212,7 +209,8 @@ def _converted(
     except SceneError as error:
         if engine == "mjx":
             raise
-        return original, kinematics_alone(original), [], str(error)
+        conversions = list(waking(original))
+        return original, kinematics_alone(original), conversions, str(error)
     return model, stepped, conversions, ""
 
 

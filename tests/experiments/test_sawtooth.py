@@ -7,7 +7,7 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.motion import CONTINUOUS, DISCRETE, SLOPE
-from experiments.sawtooth import NATIVE, Outcome, course, drawings, verdict
+from experiments.sawtooth import NATIVE, POLICY, Outcome, course, drawings, verdict
 from experiments.theme import save
 from mjxgrad.diagnostics import compare_to_slope, phases
 
@@ -18,7 +18,7 @@ def _course(tooth, continuous=2.0, **how):
     """An outcome of slope 2 and a sawtooth whose flanks have slope 5; the slope at MuJoCo's motion errs by 0.3."""
     teeth = tooth * ((_START / tooth) % 1 - 0.5) * 3
     flat = {DISCRETE: (2 * _START + teeth, 5.0), SLOPE: (2 * _START + teeth, 2.3)}
-    flat[NATIVE] = (2 * _START + teeth, 2.0)
+    flat[NATIVE] = flat[POLICY] = (2 * _START + teeth, 2.0)
     flat[CONTINUOUS] = (2 * _START + 0.01 * teeth, continuous)
     arms = {
         arm: compare_to_slope(
@@ -48,7 +48,10 @@ def test_the_verdict_counts_the_readings_where_the_mean_derivative_is_the_slope(
 
 def test_a_motion_without_teeth_is_said_to_have_none():
     nothing = np.zeros((256, 2, 1))
-    flat = {arm: compare_to_slope(_START, nothing, [nothing], (arm,)) for arm in (DISCRETE, NATIVE, SLOPE, CONTINUOUS)}
+    flat = {
+        arm: compare_to_slope(_START, nothing, [nothing], (arm,))
+        for arm in (DISCRETE, NATIVE, POLICY, SLOPE, CONTINUOUS)
+    }
     assert verdict(Outcome([course("a", "A", ("z",), 2e-3, [0.1, 0.2], flat)])).startswith("Nothing touches")
 
 
@@ -62,7 +65,7 @@ def test_every_motion_gets_its_figure(tmp_path):
     figures = save(drawings(outcome), outcome, tmp_path)
     assert [figure.file for figure in figures] == ["figures/teeth_ball.svg"]
     assert all((tmp_path / figure.file).is_file() for figure in figures)
-    assert len(outcome.rows()) == 4 * 2
+    assert len(outcome.rows()) == 5 * 2
 
 
 @pytest.mark.slow

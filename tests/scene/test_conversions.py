@@ -141,6 +141,12 @@ def test_what_does_not_move_quite_the_same_is_warned_about(source, said):
         load_scene(source)
 
 
+def test_no_body_sleeps_by_c_mujoco_either():
+    with pytest.warns(SceneWarning, match="flag sleep: disable instead of enable"):
+        scene = load_scene(_ball(flag="<flag sleep='enable'/>"), engine="mujoco")
+    assert not scene.mj_model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+
+
 def _num_touching(scene):
     """Contacts found in C MuJoCo and by the library."""
     data = mujoco.MjData(scene.mj_model)
