@@ -60,8 +60,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mjxgrad.bodies import tree
-
 _LEAST_WIDTH = 0.06  # of the impedance's width
 _STIRRED = 4.0  # steps of travel, beyond which a surface is not near
 _SMALLEST = 1e-6  # half of what is spanned (m or rad)
@@ -323,7 +321,9 @@ def levers_of(model: mujoco.MjModel) -> Float[np.ndarray, "nbody nv"]:
     """Return how far each joint velocity moves the farthest point below it, for each body that it moves (m or 1)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    is_below = tree.descendants(model) > 0
+    is_below = np.eye(model.nbody, dtype=bool)
+    for body in reversed(range(1, model.nbody)):  # parents come before their children
+        is_below[model.body_parentid[body]] |= is_below[body]
     radius = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 0.0, model.geom_rbound)
     levers = np.zeros((model.nbody, model.nv))
     for dof, joint in enumerate(model.dof_jntid.tolist()):

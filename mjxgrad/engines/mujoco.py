@@ -1,7 +1,7 @@
 """C MuJoCo: on all cores of the processor, without compilation, differentiable once; any scene that MuJoCo loads."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -19,6 +19,7 @@ from mjxgrad.engines.layout import INPUTS, MOTION
 from mjxgrad.engines.pool import pool_of
 from mjxgrad.engines.state import Pairs, State, Trajectory, data_of, direction, is_sound
 from mjxgrad.scene import Scene
+from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Contact, Discrete, Gradient, Slope
 
 _Inputs = dict[str, Array]
@@ -74,7 +75,7 @@ class MuJoCo:
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
         start, resting = self._arguments(scene, state)
         inputs = jax.tree.map(lambda x: jnp.stack([x] * num_steps), resting | {"ctrl": ctrl})
-        found = rule.roll_out(scene, start, inputs, contact.gradient)
+        found = rule.roll_out(scene, changed_numbers(scene), start, inputs, contact.gradient)
         parts = {name: found[name][-1] for name in ("qpos", "qvel", "act")}
         return dataclasses.replace(state, **parts)
 
@@ -134,17 +135,42 @@ def _closed(motion: Motion, state: State, rows: Rows) -> tuple[Trajectory, Float
     return _trajectory(states, final, ctrl, first_bad), states[3], seen
 
 
-@eqx.filter_jit
+class _Fixed:
+    """A scene whose numbers are those of its C model, but for some: programs for it are compiled once, and need no others.
+
+    A call of C MuJoCo from a program takes a twentieth of a millisecond for each array that it is given; a model has a hundred.
+    """
+
+    def __init__(self, scene: Scene, changed: Iterable[str]):
+        self.scene, self.key = scene, (id(scene.mj_model), frozenset(changed))
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Fixed) and other.scene.mj_model is self.scene.mj_model and other.key == self.key
+
+
 def _course(
     scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: _Inputs, gradient: Gradient
 ) -> tuple[Trajectory, Float[Array, "states _"]]:
     """Return the motion under known controls, and what else goes on: one call of C MuJoCo."""
+    numbers, (start, resting) = changed_numbers(scene), _arguments(scene, state)
+    return _steps(_Fixed(scene, numbers), numbers, start, resting | inputs, state, ctrl, gradient)
+
+
+@eqx.filter_jit
+def _steps(
+    fixed: _Fixed, numbers: _Inputs, start: _Inputs, inputs: _Inputs, state: State, ctrl: Float[Array, "horizon nu"],
+    gradient: Gradient,
+) -> tuple[Trajectory, Float[Array, "states _"]]:  # fmt: skip
     is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
-    start, resting = _arguments(scene, state)
     assert state.pairs is not None
     start |= {"warmstart": state.warmstart, "flight": state.pairs.flight, "held": state.pairs.held}
-    given = {name: jnp.broadcast_to(value, (len(ctrl), *value.shape)) for name, value in resting.items()}
-    found = rule.roll_out(scene, start, given | inputs | {"ctrl": jnp.where(is_finite, ctrl, 0.0)}, gradient)
+    shapes = {name: (len(ctrl), *np.shape(getattr(fixed.scene.data, name))) for name in inputs}
+    given = {name: jnp.broadcast_to(value, shapes[name]) for name, value in inputs.items()}
+    given["ctrl"] = jnp.where(is_finite, ctrl, 0.0)
+    found = rule.roll_out(fixed.scene, numbers, start, given, gradient)
     qpos, qvel, act = (jnp.concatenate([getattr(state, k)[None], found[k]]) for k in ("qpos", "qvel", "act"))
     history = jnp.concatenate([state.history[None], jnp.concatenate([found["history"], found["plugin"]], axis=1)])
     is_good = jax.vmap(is_sound)(qpos, qvel, act)
@@ -153,7 +179,7 @@ def _course(
     kept = jnp.arange(len(ctrl) + 1)
     kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
     qpos, qvel, act, history = (x[kept] for x in (qpos, qvel, act, history))
-    time = state.time + scene.model.opt.timestep * kept[-1]
+    time = state.time + numbers.get("opt.timestep", fixed.scene.mj_model.opt.timestep) * kept[-1]
     pairs = Pairs(found["flight"], found["held"])
     pairs = jax.tree.map(lambda x: jnp.where(first_bad >= 0, 0.0, x), pairs)
     final = State(qpos[-1], qvel[-1], act[-1], time, found["warmstart"], history[-1], pairs)

@@ -33,11 +33,12 @@ from mjxgrad.stepping import Gradient
 _Arrays = Mapping[str, Array]
 
 
-def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
+def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
     """Return the parts of `layout.MOTION` after each step, as MuJoCo gives them; differentiable once, by all arguments.
 
     Args:
-        scene: its model's numbers are arguments of the call, so that they may be traced, mapped over and differentiated by.
+        scene: its C model steps.
+        numbers: those of the scene's model that its C model does not have; they may be mapped over and differentiated by.
         start: `time` of shape (1,) and the parts of the motion; "warmstart", "flight" and "held" as in `State`.
         inputs: arrays with one row per step, under names of `INPUTS`; `ctrl` at least.
         gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `engines.events`.
@@ -103,7 +104,7 @@ def roll_out(scene: Scene, start: _Arrays, inputs: _Arrays, gradient: Gradient) 
 
     given = nothing() | {"warmstart": jnp.zeros_like(start["qvel"])} | dict(start)
     given |= {name: jax.lax.stop_gradient(given[name]) for name in ("flight", "warmstart")}
-    return call(changed_numbers(scene), given, dict(inputs))
+    return call(numbers, given, dict(inputs))
 
 
 def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tuple[Array, Array]:

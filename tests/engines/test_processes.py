@@ -1,0 +1,94 @@
+"""Derivatives that other processes take are those of threads, and nothing is lost where a process ends."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjxgrad.engines import pool as pools
+from mjxgrad.engines.jacobians import with_pairs
+from mjxgrad.engines.pool import Pool
+from mjxgrad.engines.processes import Processes, are_possible, processes
+from tests.processes import run_python
+
+BALL = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
+    <body pos="1 0 1"><joint name="j" axis="0 1 0" damping=".1"/><geom type="capsule" fromto="0 0 0 0 0 -.9" size=".05"/></body>
+    </worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
+_NUM, _STEPS = 6, 40
+
+
+@pytest.fixture
+def other():
+    """Processes of this test's own, which take all that is asked for."""
+    with pytest.MonkeyPatch.context() as patch:
+        own = Processes(2)
+        for name, value in (("_FEWEST", 1), ("_SHORT", 0.0), ("_LONG", 0.0), ("processes", lambda _: own)):
+            patch.setattr(pools, name, value)
+        yield own
+        own.close()
+
+
+def _maps(gradient, wanted, numbers=None):
+    """Balls that are thrown onto the floor."""
+    model, random = mujoco.MjModel.from_xml_string(BALL), np.random.default_rng(0)
+    pool = Pool(model, num_threads=2)
+    start = {"time": np.zeros((_NUM, 1)), "qpos": np.tile(model.qpos0, (_NUM, 1)), "act": np.zeros((_NUM, 0))}
+    start["qvel"] = random.normal(size=(_NUM, model.nv))
+    inputs = {"ctrl": random.normal(size=(_NUM, _STEPS, 1))}
+    before = pool._before(start, pool.run(numbers or {}, start, inputs))
+    return pool.maps(numbers or {}, before, inputs, pool.no_flight((_NUM,)), gradient=gradient, wanted=wanted)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "wanted"), [("discrete", ("ctrl",)), ("slope", (*with_pairs(("ctrl", "geom_size")), "flight"))]
+)
+def test_they_are_those_of_threads(gradient, wanted, other):
+    model = mujoco.MjModel.from_xml_string(BALL)
+    sizes = np.tile(model.geom_size, (_NUM, 1, 1))
+    sizes[:, 1, 0] += np.linspace(0, 0.01, _NUM)  # a model for each
+    numbers = {"geom_size": sizes} if gradient == "slope" else {}
+    found = _maps(gradient, wanted, numbers)
+    assert all(one for one in other.known)  # they were asked
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pools, "are_possible", lambda: False)
+        expected = _maps(gradient, wanted, numbers)
+    for name, value in expected.items():
+        # Rows that are taken together are multiplied in another order.
+        np.testing.assert_allclose(found[name], value, rtol=1e-9, atol=1e-9 * np.abs(value).max(), err_msg=name)
+
+
+def test_where_one_has_ended_threads_go_on(other):
+    for child in other.children:
+        child.kill()
+        child.wait()
+    with pytest.warns(UserWarning, match="by one process, which is slower"):
+        found = _maps("discrete", ("ctrl",))
+    assert np.abs(found["state"]).min(axis=(2, 3)).shape == (_NUM, _STEPS)
+    assert np.isfinite(found["state"]).all()
+    assert np.abs(found["ctrl"]).max() > 0
+
+
+def test_what_a_process_says_is_raised(other):
+    model = mujoco.MjModel.from_xml_string(BALL)
+    with pytest.raises(TypeError, match="missing 5 required"):
+        other.share(0, model, 1, {"state": (1,)}, lambda piece: ({},))
+
+
+def test_a_function_of_this_process_in_a_step_keeps_it_here():
+    assert are_possible()
+    mujoco.set_mjcb_control(lambda model, data: None)
+    try:
+        assert not are_possible()
+    finally:
+        mujoco.set_mjcb_control(None)
+
+
+def test_a_process_imports_no_jax():
+    """It would start in seconds, not in a quarter of one."""
+    said, _ = run_python(
+        "-c",
+        "from mjxgrad.engines import processes as p; p._START = p._START.replace('serve()', '') + "
+        "'import mjxgrad.engines.pool; sys.stdout.write(str(\"jax\" in sys.modules))'; "
+        "own = p.Processes(1); print(own.children[0].stdout.read())",
+    )
+    assert "False" in said
+    assert processes.cache_info().maxsize is None
