@@ -275,7 +275,7 @@ class Mover:
 
     def __post_init__(self):
         self._judges: dict[tuple[int, ...], Callable] = {}
-        self._num_steps, self._seconds = 0, 0.0
+        self._num_steps, self._seconds, self._is_warm = 0, 0.0, False
 
     @property
     def step_seconds(self) -> float:
@@ -307,7 +307,9 @@ class Mover:
         refined = REFINED if kind == "fine" else 1
         started = time.perf_counter()
         found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)
-        self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
+        if self._is_warm:
+            self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
+        self._is_warm = True
         course = found.pop("change", np.full((num, steps, len(change)), np.nan))
         path, bad_steps = held({name: x[:, ::refined] for name, x in found.items()})
         bad = bad_steps >= 0

@@ -133,7 +133,7 @@ def fly(
         layout: places in states.
         lengths: how far each velocity moves the farthest point of its bodies.
         timestep: h (s).
-        step: function from states and models to the motions after a step.
+        step: function from states and models to the states after a step.
         found: "felt", "slot", "apart" and "stays" with axes of motions and steps; "before" and "enters", without steps.
     """
     scale = np.concatenate([lengths, _STEPS * timestep * lengths, np.zeros(layout.num_rest)])
@@ -190,8 +190,8 @@ def _advance(
     rows = np.repeat(course.rows[motions, t][:, None], 2, axis=1)
     rows[..., layout.motion] = flight.ends[motions, slots]
     models = [course.models(motion, t) for motion in motions.tolist() for _ in range(2)]
-    ends = step(rows.reshape(-1, rows.shape[-1]), models).reshape(len(motions), 2, -1)
-    rows[..., layout.motion] = ends
+    rows = step(rows.reshape(-1, rows.shape[-1]), models).reshape(rows.shape)
+    ends = rows[..., layout.motion]
     with np.errstate(invalid="ignore"):
         apart = layout.difference(rows[:, 0], rows[:, 1]) / flight.widths[motions, slots][:, None]
     before = flight.apart[motions, slots]

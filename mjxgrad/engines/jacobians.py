@@ -20,8 +20,9 @@ from mjxgrad.engines.flight import Begun
 from mjxgrad.engines.inverse import Inverse
 from mjxgrad.engines.layout import EVERY, INPUTS, Layout
 from mjxgrad.engines.stepmap import FIRST, PAIRS
+from mjxgrad.engines.steps import Stepper
 
-_WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
+WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
 # How the names of model arrays and inputs end that move surfaces.
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
@@ -30,7 +31,7 @@ _NOTHING = 1e-9  # of a displacement by one
 # Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
 _STEEP, _NARROWER = 10.0, 1 / 30
 _TOLERANCE, _ITERATIONS = 1e-16, 200  # of the steps that are subtracted: what a solve leaves is divided by the width
-_APART = 0.5  # of the larger side's difference, by which the two sides differ where one has a jump
+APART = 0.5  # of the larger side's difference, by which the two sides differ where one has a jump
 _OF_TIME = "opt.timestep"
 _KINK = 0.1  # of a derivative, by which its two sides differ at most
 _TOGETHER = 64  # rows whose algebra is done at once
@@ -124,7 +125,7 @@ class Worker:
             self.given, self.model, self.others = given, copy.deepcopy(given), None
             self.inverse, self.is_explicit = Inverse(self.model, self.layout), inverse.has_inverse(self.model)
             self.surfaces = Surfaces(self.model, self.levers)
-            self.far = mujoco.MjData(self.surfaces.model)
+            self.far, self.stepper = mujoco.MjData(self.surfaces.model), Stepper(self.model, self.layout, 1)
         self.surfaces.widen(speeds if gradient == "slope" else 0 * speeds)
 
     def _together(self, steps: Steps, index: list[int]) -> None:
@@ -201,18 +202,18 @@ class Worker:
         if not np.isfinite(one.begun.apart).all():  # a step from beside this state may end nowhere
             one.near, one.begun = dataclasses.replace(near, events=None), None
             return
-        small = _NARROW if self.is_explicit else _WIDTH
+        small = _NARROW if self.is_explicit else WIDTH
         shift = clearance(small, events.surfaces, events.gaps, events.centres)
         if shift.any():
             self._move(one, shift)
         if self.surfaces.lead:
             for move, rates in zip(events.moves.T, events.rows, strict=True):
-                one.clear = self._off_stages(one, _WIDTH * np.abs(rates).max() * move)
+                one.clear = self._off_stages(one, WIDTH * np.abs(rates).max() * move)
 
     def _aside(self, one: _Row) -> None:
         """Take small differences about a state from which they cross no surface, and with gaps of rounding's size as they are."""
         mujoco.mj_setState(self.surfaces.model, self.far, one.before, EVERY)
-        shift, is_undecided = self.surfaces.beside(_NARROW if self.is_explicit else _WIDTH, self.far)
+        shift, is_undecided = self.surfaces.beside(_NARROW if self.is_explicit else WIDTH, self.far)
         if is_undecided:
             self._decide(one)
         if shift is not None:
@@ -261,7 +262,7 @@ class Worker:
         sides = np.array([1.0, -1.0])
         moves = events.middles.T[:, None] + (widths[:, None] * sides)[..., None] * events.moves.T[:, None]
         starts = layout.moved(one.before, moves)
-        ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
+        ends = self._steps(one.by, starts)
         felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, layout.num_rest)))
         apart = layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]
         begun = Begun(felt, ends[..., layout.motion], 2 * widths, apart)
@@ -310,7 +311,7 @@ class Worker:
         changes = widths[:, None, None] * np.array([1.0, -1.0])[:, None] * directions[:, None]
         starts = layout.moved(one.clear, changes)
         if not one.is_explicit:
-            ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
+            ends = self._steps(one.by, starts)
             found[:, moving] = (layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]).T
             return
         ends = one.by.solutions(
@@ -325,7 +326,7 @@ class Worker:
 
     def _by_steps(self, one: _Row) -> None:
         """Write differences of whole steps by state and controls."""
-        width = _WIDTH if one.near is None or not one.near.is_rough or self.surfaces.lead else _RUBBING
+        width = WIDTH if one.near is None or not one.near.is_rough or self.surfaces.lead else _RUBBING
         layout = self.layout
         one.found["state"][:] = self._smooth(one, np.eye(layout.num_changes), width).T
         if "ctrl" in one.found:
@@ -351,10 +352,10 @@ class Worker:
         left, signs = np.arange(len(directions)), np.array([1.0, -1.0])
         for narrower in (1.0, _NARROWER, _NARROWER**2):
             starts = self.layout.moved(one.clear, narrower * width * signs[:, None] * directions[left, None])
-            ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts])
+            ends = self._steps(one.by, starts)
             sides = self.layout.difference(ends, middle) * signs[:, None] / (narrower * width)
             both, size = np.linalg.norm(sides, axis=2), np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1)
-            jumps = (size > _APART * both.max(axis=1)) & (both.max(axis=1) > 1 / self.model.opt.timestep)
+            jumps = (size > APART * both.max(axis=1)) & (both.max(axis=1) > 1 / self.model.opt.timestep)
             least = np.take_along_axis(sides, both.argmin(axis=1)[:, None, None], axis=1)[:, 0]
             chosen = np.where(jumps[:, None], least, sides.mean(axis=1))
             size = np.linalg.norm(chosen, axis=1)
@@ -368,7 +369,7 @@ class Worker:
 
     def _between(self, one: _Row, starts: Float[np.ndarray, "columns 2 size"], widths: np.ndarray) -> np.ndarray:
         """Return differences of the ends of steps over their widths, a row each."""
-        ends = np.array([[self._step(one.by, start) for start in pair] for pair in starts]).reshape(starts.shape)
+        ends = self._steps(one.by, starts)
         return self.layout.difference(ends[:, 0], ends[:, 1]) / widths[:, None]
 
     def _off_stages(self, one: _Row, change: Float[np.ndarray, " nv"]) -> np.ndarray:
@@ -420,14 +421,14 @@ class Worker:
             and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
         ):
             mujoco.mj_setState(model, data, row, EVERY)
-            mujoco.mjd_transitionFD(model, data, _WIDTH, True, None, None, by_state, by_control)
+            mujoco.mjd_transitionFD(model, data, WIDTH, True, None, None, by_state, by_control)
         else:
-            changes = _WIDTH * np.eye(self.layout.num_changes)
+            changes = WIDTH * np.eye(self.layout.num_changes)
             starts = [(by_state, self.layout.moved(row, changes), self.layout.moved(row, -changes))]
-            starts += [(by_control, row + (change := _WIDTH * np.eye(len(row))[place]), row - change)]
+            starts += [(by_control, row + (change := WIDTH * np.eye(len(row))[place]), row - change)]
             for matrix, *sides in starts:
                 for column, (above, below) in enumerate(zip(*sides, strict=True)):
-                    matrix[:, column] = (self._read(above) - self._read(below)) / (2 * _WIDTH)
+                    matrix[:, column] = (self._read(above) - self._read(below)) / (2 * WIDTH)
         for name in (one for one in found if is_other(one)):
             for column, (put, size, is_zero) in enumerate(self._changes(self.inverse, row, name)):
                 read = lambda amount, put=put: self._read(put(amount))  # noqa: E731
@@ -472,7 +473,7 @@ class Worker:
         Numbers of the model change here and where gaps are measured.
         """
         if name in INPUTS:
-            place, size = self.layout.places[name], min(_WIDTH, HAIR) if moves_gaps(name) else _WIDTH
+            place, size = self.layout.places[name], min(WIDTH, HAIR) if moves_gaps(name) else WIDTH
             for entry in range(place.start, place.stop):
                 yield functools.partial(_with_entry, row, entry), size, False
             return
@@ -481,7 +482,7 @@ class Worker:
         present = [np.array(getattr(holder, attribute, []), float).reshape(-1) for holder in holders]
         for entry, values in enumerate(np.transpose(present).tolist()):
             change = functools.partial(_with_number, row, holders, attribute, entry, values)
-            yield change, 10 * _WIDTH * abs(values[0]) or _WIDTH, values[0] == 0.0
+            yield change, 10 * WIDTH * abs(values[0]) or WIDTH, values[0] == 0.0
 
     def _rates(self, put: Callable[[float], np.ndarray], size: float, events: Events) -> Float[np.ndarray, " modes"]:
         """Return by how much the modes of events change with what is put."""
@@ -493,6 +494,11 @@ class Worker:
         (first, before), (last, after) = alike[-2:] if len(alike) > 1 else 2 * alike
         change = (after - before) / (last - first if last != first else 1.0)
         return events.weights @ change[events.index]
+
+    def _steps(self, by: Inverse, starts: Float[np.ndarray, "columns 2 size"]) -> np.ndarray:
+        """Return the states after steps from both sides of each column."""
+        rows = starts.reshape(-1, starts.shape[-1])
+        return self.stepper(rows, [by.model] * len(rows)).reshape(starts.shape)
 
     def _step(self, by: Inverse, row: np.ndarray) -> np.ndarray:
         """Return the state after a step."""

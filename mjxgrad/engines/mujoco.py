@@ -179,7 +179,8 @@ def _steps(
     kept = jnp.arange(len(ctrl) + 1)
     kept = jnp.where(first_bad >= 0, jnp.minimum(kept, first_bad), kept)
     qpos, qvel, act, history = (x[kept] for x in (qpos, qvel, act, history))
-    time = state.time + numbers.get("opt.timestep", fixed.scene.mj_model.opt.timestep) * kept[-1]
+    timestep: Any = numbers.get("opt.timestep", fixed.scene.mj_model.opt.timestep)
+    time = state.time + timestep * kept[-1]
     pairs = Pairs(found["flight"], found["held"])
     pairs = jax.tree.map(lambda x: jnp.where(first_bad >= 0, 0.0, x), pairs)
     final = State(qpos[-1], qvel[-1], act[-1], time, found["warmstart"], history[-1], pairs)

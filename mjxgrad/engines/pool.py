@@ -11,27 +11,25 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
-import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._warnings import collected
 from mjxgrad.engines.events import levers_of
 from mjxgrad.engines.flight import NUM_SLOTS, Course, Flight, fly
-from mjxgrad.engines.jacobians import Steps, Worker, solved, with_pairs
+from mjxgrad.engines.jacobians import APART, WIDTH, Steps, Worker, solved, with_pairs
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
 from mjxgrad.engines.processes import are_possible, are_started, processes
 from mjxgrad.engines.stepmap import FIRST, PAIRS, advance
+from mjxgrad.engines.steps import Stepper
 from mjxgrad.scene.numbers import with_numbers
 
-START = ("time", *MOTION)
 ONCE = (*FIRST, "flight")
 """What is found of a whole motion, not of each of its steps."""
 _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _NUMBERS = itertools.count()  # of pools
 # Other processes take derivatives of so many steps and more, if they take so long (s) here. Their start takes half a second.
 _FEWEST, _SHORT, _LONG = 32, 0.05, 2.0
-_A_FEW = 8  # states
 _MOST_NUMBERS = 2e7  # of derivatives that are held at a time, where they are not asked for
 
 _Arrays = Mapping[str, np.ndarray]
@@ -49,9 +47,12 @@ class Pool:
     def __init__(self, mj_model: mujoco.MjModel, *, num_threads: int = _NUM_THREADS):
         self.mj_model, self.lock = mj_model, threading.Lock()
         self.num_threads, self.number = num_threads, next(_NUMBERS)
-        self.pool, self.threads = mujoco.rollout.Rollout(nthread=num_threads), ThreadPoolExecutor(num_threads)
-        self.memory = [mujoco.MjData(mj_model) for _ in range(num_threads)]
-        self.start, self.layout = mujoco.MjData(mj_model), Layout(mj_model)
+        self.threads, self.start, self.layout = (
+            ThreadPoolExecutor(num_threads),
+            mujoco.MjData(mj_model),
+            Layout(mj_model),
+        )
+        self.steps = Stepper(mj_model, self.layout, num_threads)
         self.places = self.layout.places
         self.plain = with_numbers(mj_model, {})
         # A state that is not finite stays so, and is seen.
@@ -96,7 +97,7 @@ class Pool:
                 mujoco.mj_step(models[i], data)
                 mujoco.mj_getState(models[i], data, rows[i], EVERY)
 
-        self._share(work, self.memory, len(rows))
+        self._share(work, self.steps.memory, len(rows))
         return {name: rows[:, None, self.places[name]] for name in MOTION} | {
             "warmstart": rows[:, self.places["warmstart"]]
         }
@@ -109,36 +110,10 @@ class Pool:
             place = self.places[name].start - self.places["ctrl"].start
             width = math.prod(value.shape[2:])
             given[..., place : place + width] = value.reshape(*value.shape[:2], width)
-        warm = rows[:, self.places["warmstart"]]
-        return self._motions(self._together(rows, models, given, warm))
-
-    def _together(
-        self, rows: np.ndarray, models: list[mujoco.MjModel], given: np.ndarray, warm: np.ndarray
-    ) -> np.ndarray:
-        """Return physical states after each step of several motions at once."""
-        full = np.concatenate([rows[:, self.places[name]] for name in START], axis=1)
-        return np.asarray(
-            self.pool.rollout(models, self.memory, full, given, control_spec=USER, initial_warmstart=warm)[0]
-        )
-
-    def _motions(self, found: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the parts of physical states, of which plugins come last."""
-        parts = {name: found[..., self.places[name]] for name in MOTION[:-1]}
-        return parts | {"plugin": found[..., found.shape[-1] - self.layout.sizes["plugin"] :]}
-
-    def _steps(self, rows: Float[np.ndarray, "rows size"], models: list[mujoco.MjModel]) -> np.ndarray:
-        """Return the motions after single steps of many states."""
-        if len(rows) <= _A_FEW:  # a call of the pool takes as long as ten steps
-            ends = rows.copy()
-            for model, end in zip(models, ends, strict=True):
-                mujoco.mj_setState(model, self.memory[0], end, EVERY)
-                mujoco.mj_step(model, self.memory[0])
-                mujoco.mj_getState(model, self.memory[0], end, EVERY)
-            return ends[:, self.layout.motion]
-        user = rows[:, None, self.places["ctrl"].start : self.places["mocap_quat"].stop]
-        warm = rows[:, self.places["warmstart"]]
-        parts = self._motions(self._together(rows, models, user, warm)[:, 0])
-        return np.concatenate([parts[name] for name in MOTION], axis=-1)
+        step, warm = self.steps, rows[:, self.places["warmstart"]]
+        full = step.full(rows)
+        found = step.rollout.rollout(models, step.memory, full, given, control_spec=USER, initial_warmstart=warm)
+        return step.motions(np.asarray(found[0]))
 
     def steer(
         self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
@@ -175,7 +150,7 @@ class Pool:
                         mujoco.mj_getState(models[i], data, end, motion)
                         state = end
 
-            self._share(work, self.memory, len(models))
+            self._share(work, self.steps.memory, len(models))
         return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
 
     def maps(
@@ -273,11 +248,11 @@ class Pool:
             work.is_finite.reshape(num, steps),
         )
         pairs = Flight.unpacked(flight, self.layout, course.rows[:, 0])
-        fly(pairs, course, self.layout, self.lengths, models[0].opt.timestep, self._steps, found)
+        fly(pairs, course, self.layout, self.lengths, models[0].opt.timestep, self.steps, found)
         if "flight" in wanted:
             ends = course.rows[:, -1].copy()
             if (chosen := np.flatnonzero((pairs.widths > 0).any(axis=1))).size:
-                ends[np.ix_(chosen, self.layout.motion)] = self._steps(ends[chosen], [models[k] for k in chosen])
+                ends[chosen] = self.steps(ends[chosen], [models[k] for k in chosen])
             found["flight"][:] = pairs.packed(self.layout, ends)
 
     def _work(
@@ -361,8 +336,11 @@ class Pool:
         num, steps = after["qvel"].shape[:2]
         size, before = self.layout.num_changes, self._before(start, after)
         after["change"] = np.zeros((num, steps, size))
+        if gradient == "discrete":
+            self._along(numbers, before, inputs, changes, after["change"])
+            return after
         wanted = ("ctrl",) if changes[1].any() else ()
-        names = with_pairs(wanted) if gradient == "slope" else wanted
+        names = with_pairs(wanted)
         together = max(1, int(_MOST_NUMBERS / (steps * size * (2 * size + NUM_SLOTS))))
         for first in range(0, num, together):
             part = slice(first, first + together)
@@ -376,6 +354,48 @@ class Pool:
                     one |= {"by state": found["ctrl"][k, t] @ push if wanted else 0.0, "by felt": 0.0}
                     main, held, after["change"][motion, t] = advance(np, main, held, one)
         return after
+
+    @np.errstate(invalid="ignore", over="ignore")
+    def _along(
+        self,
+        numbers: _Arrays,
+        before: _Arrays,
+        inputs: _Arrays,
+        changes: tuple[np.ndarray, np.ndarray],
+        found: np.ndarray,
+    ) -> None:
+        """Write what becomes of changes by differences of whole steps along them: three steps each, not a hundred.
+
+        Where the two sides differ as at a jump, or one is beyond the limits of a control, the other one counts.
+        """
+        with self.lock, collected():
+            _, numbers, before, inputs = self._flat(1, numbers, before, inputs)
+            models = [self._exact(model) for model in self._models(numbers, len(found))]
+            controls, timestep = self.places["ctrl"], models[0].opt.timestep
+            low, high = np.where(
+                self.mj_model.actuator_ctrllimited, self.mj_model.actuator_ctrlrange.T, [[-np.inf], [np.inf]]
+            )
+            main, sides = changes[0], np.array([1.0, 0.0, -1.0])[:, None, None]
+            for t in range(found.shape[1]):
+                rows, push = self._rows({k: x[:, t] for k, x in {**before, **inputs}.items()}), changes[1][:, t]
+                size = np.abs(np.concatenate([main, push], axis=1)).max(axis=1, keepdims=True)
+                width = WIDTH / np.where(size > 0, size, 1.0)
+                starts = self.layout.moved(rows, sides * width * main)
+                starts[..., controls] += sides * width * push
+                ends = self.steps(starts.reshape(-1, starts.shape[-1]), 3 * models).reshape(starts.shape)
+                both = self.layout.difference(ends[:2], ends[1:]) / width
+                is_within = (low <= starts[1, :, controls]) & (starts[1, :, controls] <= high)
+                ahead, behind = (
+                    is_within & ((x < low) | (x > high)) for x in (starts[0, :, controls], starts[2, :, controls])
+                )
+                sizes = np.linalg.norm(both, axis=2)
+                is_jump = np.linalg.norm(both[0] - both[1], axis=1) > APART * sizes.max(axis=0)
+                is_jump &= sizes.max(axis=0) > np.linalg.norm(main, axis=1) / timestep
+                first = np.where(is_jump, sizes[0] < sizes[1], True) & ~ahead.any(axis=1)
+                last = np.where(is_jump, sizes[1] <= sizes[0], True) & ~behind.any(axis=1)
+                share = np.stack([first, last]) / np.maximum(first.astype(int) + last, 1)
+                main = np.nan_to_num(np.sum(share[..., None] * both, axis=0), posinf=0.0, neginf=0.0)
+                found[:, t] = main
 
     def no_flight(self, batch: tuple[int, ...]) -> np.ndarray:
         """Return the room of motions without pairs in flight."""

@@ -40,7 +40,9 @@ def _flown(matrices, begun, factors):
     times = iter(factors)
 
     def step(states, models):
-        return states[:, LAYOUT.motion] * next(times)
+        ends = states.copy()
+        ends[:, LAYOUT.motion] *= next(times)
+        return ends
 
     pairs = _nothing()
     fly(pairs, course, LAYOUT, np.ones(1), 0.1, step, found)
