@@ -382,7 +382,8 @@ def table(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
             line[part] = f"{sum(checked)} of {len(checked)}"
         line["untold"] = sum(bool(row["untold"]) for row in own)
         line |= {f"slope {word}": sum(row["50 steps"] == word for row in own) for word in words}
-        line["s to a gradient"] = np.nanmedian([row["seconds"] or np.nan for row in own]).round(1)
+        seconds = [row["seconds"] for row in own if row["seconds"]]
+        line["s to a gradient"] = np.median(seconds).round(1) if seconds else np.nan
         lines.append(line | {"failed": sum(bool(row["failed"]) for row in own)})
     return lines
 

@@ -159,7 +159,7 @@ def check(
     names, outcomes = _outcomes(scene, outcome, rng)
     if cost is not None and (motions.bad_steps < 0).any():
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
-    measured = None
+    measured, price = None, 0.0  # of a slope of one step, in s
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
@@ -174,6 +174,7 @@ def check(
                 log=say,
                 first=lambda one: say(f"- First verdict. {findings.slope_finding(findings.slopes(one)).text}"),
             )
+        price = mover.slope_seconds
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
     if mjx and (motions.bad_steps < 0).any():
@@ -183,6 +184,9 @@ def check(
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
     advice = findings.recommend(motions, stability, measured, slots)
+    if price:
+        told = f"A slope over the {advice.horizon} steps of the program below takes {price * advice.horizon:.2g} s here"
+        found.append(Finding("note", f"{told}, by C MuJoCo in a batch."))
     path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,

@@ -279,8 +279,13 @@ class Mover:
 
     @property
     def step_seconds(self) -> float:
-        """The mean duration of a step of a batch so far."""
+        """The mean duration of a step of a batch with its slope, so far."""
         return self._seconds / max(self._num_steps, 1)
+
+    @property
+    def slope_seconds(self) -> float:
+        """The mean duration of a step of one motion with its slope, so far."""
+        return self.step_seconds / self.size
 
     def move(
         self,
@@ -307,7 +312,7 @@ class Mover:
         refined = REFINED if kind == "fine" else 1
         started = time.perf_counter()
         found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)
-        if self._is_warm:
+        if self._is_warm and kind == "slope":
             self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
         self._is_warm = True
         course = found.pop("change", np.full((num, steps, len(change)), np.nan))
