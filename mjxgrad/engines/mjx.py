@@ -14,10 +14,12 @@ from mjxgrad._programs import compiled, is_traced
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import first_missed, slot_geoms
+from mjxgrad.engines.events import levers_of
 from mjxgrad.engines.engine import Motion, Rows, one_each
 from mjxgrad.engines.state import State, Trajectory, data_of, direction, is_sound, state_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
+from mjxgrad.stepping import pairs
 from mjxgrad.stepping import Contact, Discrete, Onset, Slope, Smoothing, forward, step
 from mjxgrad.stepping.onset import reach
 
@@ -72,6 +74,7 @@ class _Carry(NamedTuple):
     """
 
     state: State
+    flight: pairs.Flight | None
     before: Array | None
     first_bad: Array
     unsolved: Array
@@ -83,6 +86,17 @@ class _Carry(NamedTuple):
 class _Scan(Motion):
     """The loop over the steps of one rollout."""
 
+    @property
+    def follows(self) -> bool:
+        return isinstance(self.contact, Slope) and pairs.NUM_SLOTS > 0 and not self.measure_growth
+
+    def whole(self, carry: _Carry) -> State:
+        state = carry.state
+        if carry.flight is None:
+            return state
+        seen = pairs.whole(self.scene.model, pairs.Motion(state.qpos, state.qvel, state.act), carry.flight)
+        return dataclasses.replace(state, **seen._asdict())
+
     def begin(self, state: State) -> _Carry:
         """Return the carry of the first step."""
         looks = self.policy is not None and self.policy_sees == "observations"
@@ -91,6 +105,7 @@ class _Scan(Motion):
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
         return _Carry(
             dataclasses.replace(state, pairs=None),
+            pairs.no_flight(self.scene.model, self.scene.data) if self.follows else None,
             self.scene.data.ctrl if looks else None,
             jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)),
             jnp.zeros((), jnp.int32),
@@ -101,16 +116,20 @@ class _Scan(Motion):
 
     def advance(self, carry: _Carry, given: tuple[Array, Rows]) -> tuple[_Carry, tuple]:
         """Take one step, and return the next carry and the outputs of this step."""
-        state, model = carry.state, self.scene.model
+        state, model = self.whole(carry), self.scene.model
+        flight = carry.flight
         index, rows = given
         row, disturbance, forces = rows.controls, rows.noise, rows.inputs
         seen = None if carry.before is None else self.look(state, carry.before, forces)
         if self.policy is not None:
             row = one_each(self.policy(self.params, state if carry.before is None else seen), model.nu)
         ctrl = row + disturbance
-        data = data_of(self.scene, state, ctrl).replace(**forces)
+        data = data_of(self.scene, carry.state, ctrl).replace(**forces)
         tangent, growth = carry.tangent, carry.growth
-        if tangent is None or growth is None:
+        if flight is not None:
+            lengths = tuple(levers_of(self.scene.mj_model).max(axis=0).tolist())
+            stepped, flight = pairs.advance(model, data, flight, lengths)
+        elif tangent is None or growth is None:
             stepped = step(model, data, contact=self.contact)
         else:
             stepped, tangent, growth = self.measure(data, tangent, growth)
@@ -118,7 +137,8 @@ class _Scan(Motion):
         is_bad = ~is_sound(moved.qpos, moved.qvel, moved.act)
         first_bad = jnp.where((carry.first_bad < 0) & is_bad, index, carry.first_bad)
         following = _Carry(
-            jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), state, moved),
+            jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), carry.state, moved),
+            flight,
             None if carry.before is None else ctrl.astype(carry.before.dtype),
             first_bad,
             carry.unsolved + ((first_bad < 0) & (stepped._impl.solver_niter > model.opt.iterations)),
@@ -126,7 +146,7 @@ class _Scan(Motion):
             tangent,
             growth,
         )
-        return following, (state.qpos, state.qvel, state.act, ctrl, self.look(state, ctrl, forces, stepped), seen)
+        return following, (state.qpos, state.qvel, state.act, ctrl, self.look(state, ctrl, forces, None if flight is not None else stepped), seen)
 
     def measure(self, data: mjx.Data, tangent: tuple, growth: Array) -> tuple[mjx.Data, tuple[Array, Array], Array]:
         """Return the data after a step, the tangent there, and its largest norm so far."""
@@ -160,7 +180,7 @@ def _roll_out(motion: Motion, state: State, rows: Rows) -> Trajectory:
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     first, steps = scan.begin(state), jnp.arange(len(rows.controls), dtype=jnp.int32)
     end, (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(advance, first, (steps, rows))
-    final, growth = end.state, end.growth
+    final, growth = scan.whole(end), end.growth
     if scan.observe is not None:
         last = scan.look(final, ctrl[-1], jax.tree.map(lambda x: x[-1], rows.inputs))
         observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)
