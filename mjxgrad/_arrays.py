@@ -93,3 +93,19 @@ def one_key(key: Any) -> None:
     if not ((is_new and shape == ()) or (dtype == jnp.uint32 and shape == (2,))):
         given = f"an array of shape {shape}" if shape else repr(key)
         raise ValueError(f"key must be one of jax.random.key, got {given}; jax.vmap takes several")
+
+
+def with_derivative_of(value: Any, other: Any) -> Any:
+    """Return a tree of arrays, exactly, with the derivative of another."""
+    # Under `jax.vmap` an empty array loses the batch in one of a custom derivative's two functions.
+    return jax.tree.map(lambda x, y: _with_derivative_of(x, y) if x.size else x, value, other)
+
+
+@jax.custom_jvp
+def _with_derivative_of(value, other):
+    return value
+
+
+@_with_derivative_of.defjvp
+def _with_derivative_of_jvp(primals, tangents):
+    return _with_derivative_of(*primals), tangents[1]

@@ -14,7 +14,6 @@ from mjxgrad._programs import compiled, is_traced
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import first_missed, slot_geoms
-from mjxgrad.engines.events import levers_of
 from mjxgrad.engines.engine import Motion, Rows, one_each
 from mjxgrad.engines.state import State, Trajectory, data_of, direction, is_sound, state_of
 from mjxgrad.scene import Scene
@@ -127,8 +126,7 @@ class _Scan(Motion):
         data = data_of(self.scene, carry.state, ctrl).replace(**forces)
         tangent, growth = carry.tangent, carry.growth
         if flight is not None:
-            lengths = tuple(levers_of(self.scene.mj_model).max(axis=0).tolist())
-            stepped, flight = pairs.advance(model, data, flight, lengths)
+            stepped, flight = pairs.follow(model, data, flight)
         elif tangent is None or growth is None:
             stepped = step(model, data, contact=self.contact)
         else:

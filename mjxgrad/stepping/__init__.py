@@ -12,6 +12,7 @@ from mjxgrad.stepping.contact import (
     check_contact,
     own_motion,
 )
+from mjxgrad.stepping.forward import forward, solve
 from mjxgrad.stepping.rows import contact_force
 from mjxgrad.stepping.smoothing import smoothing_warnings
-from mjxgrad.stepping.step import forward, solve, step
+from mjxgrad.stepping.step import step

@@ -86,8 +86,6 @@ _SLIP = 3.0
 # Factor on the acceleration by motors in the width, and its bound in widths of the impedance. With less of either, feet of MuJoCo
 # Playground's robots chatter; without a bound, a strong servo holds a light link off the floor.
 _PRESS, _WIDEST = 3.0, 10.0
-# Half the ramp's least width along MuJoCo's own motion, in widths of the impedance; as in `engines.events` for C MuJoCo's step.
-_AT_MOTION = 0.06
 # Width of an impedance (m) beyond any contact, and the width used in its place.
 _ENDLESS, _USUAL_WIDTH = 1e3, 1e-3
 # Ratio to the slow speed beyond which a contact is an impact; fourth powers beyond it are too large for single precision.
@@ -166,13 +164,8 @@ class TwoSolves(eqx.Module):
     is_split: Bool[Array, ""]
 
 
-def begin(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], how: Onset | _Vector
-) -> tuple[list[Block], TwoSolves | None]:
-    """Return rows that are active if they act for any part of the step, and its two solves; None if no row begins or ends.
-
-    The shares are those of an onset; or, with the velocity after MuJoCo's step, of MuJoCo's own motion, for a derivative there.
-    """
+def begin(model: mjx.Model, data: mjx.Data, blocks: list[Block], onset: Onset) -> tuple[list[Block], TwoSolves | None]:
+    """Return rows that are active if they act for any part of the step, and its two solves; None if no row begins or ends."""
     if not any(block.rows_each for block in blocks):
         return blocks, None
     found, sides, rows = [], [], []
@@ -182,7 +175,7 @@ def begin(
             found.append(jnp.ones_like(block.residual))
             sides.append(None)
             continue
-        share, side = _share(model, data, block, how)
+        share, side = _share(model, data, block, onset)
         share = jnp.repeat(share, block.rows_each)
         present = jnp.where(block.residual > 0, block.impedance.onset, block.impedance.present)
         impedance = Impedance(present, block.impedance.full, block.impedance.onset)
@@ -218,20 +211,15 @@ class _Side(eqx.Module):
     map: RowMap
 
 
-def _share(model: mjx.Model, data: mjx.Data, block: Block, how: Onset | _Vector) -> tuple[_PerContact, _Side | None]:
+def _share(model: mjx.Model, data: mjx.Data, block: Block, onset: Onset) -> tuple[_PerContact, _Side | None]:
     """Return φ of each contact or limit of a block, and its other side; None where no sides can change."""
     rates = block.map.mv(data.qvel).reshape(-1, block.rows_each)
     rate, distance = _normal(block, rates), block.residual[:: block.rows_each]
     travel = model.opt.timestep * jnp.abs(rate)
-    if isinstance(how, Onset):
-        least = _least_width(model, data, block, how, rates, rate)
-        width = jnp.where(travel > least, travel, least)
-        slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
-        distance = distance + model.opt.timestep * rate * slow
-    else:
-        least = 2 * _AT_MOTION * _depth(block.solimp[:: block.rows_each])
-        ahead = model.opt.timestep * jnp.abs(_normal(block, block.map.mv(how).reshape(-1, block.rows_each)))
-        width = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(travel, ahead), least))
+    least = _least_width(model, data, block, onset, rates, rate)
+    width = jnp.where(travel > least, travel, least)
+    slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
+    distance = distance + model.opt.timestep * rate * slow
     if block.slots is None:
         return _ramp(distance, width, 0.5), None
     slots, contacts = slot_geoms(model, data), slice(*block.slots)

@@ -1,20 +1,26 @@
 r"""The slope of an outcome by MJX: motions from either side of each event, followed beside the motion itself.
 
-The rule is that of `engines.events` and `engines.flight`, which say why: a change of the start moves a crossing of a surface to
-another step. Differences of two motions that lie a step's travel apart say what that does, until the derivative along the motion
-explains them. Here each motion has a few slots for such pairs, and everything has a fixed size, so that a GPU takes thousands of
+The rule is that of `engines.events` and `engines.flight`, which say why: a change of the start moves the crossing of a surface to
+another step. Two motions that lie a step's travel apart tell what that does, until the derivative along the motion explains how
+they differ. Here each motion has a few slots for such pairs, and everything has a fixed size, so that a GPU takes thousands of
 motions at a time.
 
-Of a pair, D is the difference of its motions over their distance at first, h what the event has felt of a change. A state's
-derivative is that of the motion, x, and of all pairs together,
+Of a pair, D is the difference of its two motions over how far apart they began, and h what its event has felt of a change. The
+change of a state is that along the motion, x, and of all pairs together:
 
-    whole = x + Σ D h,        x' = A (1 - P L) x + B u,        h' = h, or L x where a pair begins.
+    whole = x + Σ D h,        x' = A (1 - P L) x + B u,        h' = h;  h' = L x where a pair begins;  x += D h where one is let go.
 
-h is carried as a zero whose derivative it is, and D, P and L are constants to the derivative. So plain forward and reverse mode
-of this program are the rule, and a pair's steps are not differentiated. Where nothing is differentiated, nothing is followed.
+h is carried as a zero that has a derivative, and D, P and L are constants to it. So forward and reverse mode of this program are
+the rule; the motions of pairs are stepped, not differentiated. Where nothing is differentiated, no pair begins.
+
+- A, along the motion, is one linear program, which also tells whether it explains a pair.
+- Of all contacts and limits near their surface the nearest count, as many as there are slots.
+- What a change of the model moves (a radius, a range) is in L, by the derivative of the gaps.
+- A pair that lacks a slot takes that of the pair which is least apart.
 """
 
-import dataclasses
+import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,38 +32,54 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from mjxgrad._arrays import with_derivative_of
 from mjxgrad._mjx import mjx
 from mjxgrad.batched.cholesky import SOLUTION
+from mjxgrad.batched.maps import safe_norm
+from mjxgrad.batched.sparse import sparsely
+from mjxgrad.bodies import tree
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import is_blind, slot_geoms
+from mjxgrad.stepping.contact import Discrete
+from mjxgrad.stepping.forward import advance, at_full_precision, smooth
 from mjxgrad.stepping.rows import Block
-from mjxgrad.stepping.step import _smooth, step
 
 NUM_SLOTS = 4
-# As in `engines.events` and `engines.flight`.
+# These are as in `engines.events` and `engines.flight`.
 _LEAST_WIDTH, _USUAL_WIDTH, _SMALLEST, _STIRRED, _STAGES = 0.06, 1e-3, 1e-6, 4.0, 1.2
 _NO_JUMP, _FARTHEST = 0.01, 10.0
 _NUM_ALIKE, _ALIKE, _FAR, _LONGEST, _BESIDE, _STEPS = 3, 0.05, 10.0, 100, 0.5, 10
-_TINY = 1e-30
+_LEAST_LENGTH = 1e-3  # of a lever, over the extent of the model
+_COARSER = 10.0  # times, in single precision
+_LOOSE = 1e-3  # of the inverse inertia of rows that are held: they may depend on each other
+# Inputs that move nothing within a step.
+_FORCES = ("ctrl", "qfrc_applied", "xfrc_applied", "time", "qacc_warmstart")
 
 _Vector = Float[Array, " nv"]
+_Change = Float[Array, " size"]
+
+
+class Motion(NamedTuple):
+    """What moves, of a state."""
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    act: Float[Array, " na"]
 
 
 class Flight(eqx.Module):
-    """Pairs of motions in flight beside one motion.
+    """Pairs of motions in flight beside a motion.
 
     Attributes:
-        qpos, qvel, act: both motions of each.
-        widths: how far apart they began (m or rad); 0 where a slot is free.
-        left: for how many steps they go on at most.
-        alike: for how many steps the derivative of the motion has explained them.
-        apart: D.
-        held: h; zeros that have a derivative.
+        ends: both motions of each, with axes of slots and sides.
+        widths: how far apart they began (m or rad); 0 in a free slot.
+        left: for how many steps they may go on.
+        alike: for how many steps the derivative along the motion has explained them.
+        apart: D, in tangent space.
+        held: h; zeros whose derivative it is.
     """
 
-    qpos: Float[Array, "slots 2 nq"]
-    qvel: Float[Array, "slots 2 nv"]
-    act: Float[Array, "slots 2 na"]
+    ends: Motion
     widths: Float[Array, " slots"]
     left: Int[Array, " slots"]
     alike: Int[Array, " slots"]
@@ -65,60 +87,12 @@ class Flight(eqx.Module):
     held: Float[Array, " slots"]
 
 
-def no_flight(model: mjx.Model, data: mjx.Data, num: int = NUM_SLOTS) -> Flight:
-    """Return the room of a motion without pairs in flight."""
-    zeros = lambda *shape: jnp.zeros(shape, data.qvel.dtype)  # noqa: E731
-    size = 2 * model.nv + model.na
-    return Flight(
-        zeros(num, 2, model.nq),
-        zeros(num, 2, model.nv),
-        zeros(num, 2, model.na),
-        zeros(num),
-        jnp.zeros(num, jnp.int32),
-        jnp.zeros(num, jnp.int32),
-        zeros(num, size),
-        zeros(num),
-    )
-
-
-@jax.custom_jvp
-def _with_derivative_of(value, other):
-    """Return the first argument, exactly, with the derivative of the second."""
-    return value
-
-
-@_with_derivative_of.defjvp
-def _with_derivative_of_jvp(primals, tangents):
-    return _with_derivative_of(*primals), tangents[1]
-
-
-class Motion(NamedTuple):
-    """What moves."""
-
-    qpos: Array
-    qvel: Array
-    act: Array
-
-
-def _changed(model: mjx.Model, motion: Motion, change: Float[Array, " size"]) -> Motion:
-    """Return a motion changed in tangent space."""
-    nv = model.nv
-    return Motion(
-        integrate_position(model, motion.qpos, change[:nv], 1.0),
-        motion.qvel + change[nv : 2 * nv],
-        motion.act + change[2 * nv :],
-    )
-
-
-def _with_change(model: mjx.Model, motion: Motion, change: Float[Array, " size"]) -> Motion:
-    """Return a motion, exactly, with the derivative of one that is changed by zeros."""
-    return Motion(*map(_with_derivative_of, motion, _changed(model, motion, change)))
-
-
-def _difference(model: mjx.Model, start: Motion, end: Motion) -> Float[Array, " size"]:
-    return jnp.concatenate(
-        [position_change(model, start.qpos, end.qpos), end.qvel - start.qvel, end.act - start.act]
-    )
+def no_flight(model: mjx.Model, data: mjx.Data) -> Flight:
+    """Return free slots."""
+    count, size, dtype = NUM_SLOTS, 2 * model.nv + model.na, data.qvel.dtype
+    ends = Motion(*(jnp.zeros((count, 2, n), dtype) for n in (model.nq, model.nv, model.na)))
+    none, steps = jnp.zeros(count, dtype), jnp.zeros(count, jnp.int32)
+    return Flight(ends, none, steps, steps, jnp.zeros((count, size), dtype), none)
 
 
 def whole(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
@@ -126,8 +100,76 @@ def whole(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
     return _with_change(model, motion, jax.lax.stop_gradient(flight.apart).T @ flight.held)
 
 
+def taken(data: mjx.Data) -> Motion:
+    """Return what moves of data."""
+    return Motion(data.qpos, data.qvel, data.act)
+
+
+def put(data: mjx.Data, motion: Motion) -> mjx.Data:
+    """Return data with another motion."""
+    return data.replace(**motion._asdict())
+
+
+def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, Flight]:
+    """Take a motion, and what is in flight beside it, through a step of MuJoCo.
+
+    Returns:
+        Data after the step, whose derivative is along the motion alone; `whole` adds the rest.
+    """
+    program = _Program(model, data)
+
+    @jax.custom_jvp
+    def run(flight: Flight, *given: Array) -> tuple[mjx.Data, Flight]:
+        return _as_batched(program.motion(given).qpos, (program.step(*given), flight))
+
+    def differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+        with at_full_precision(model, data):
+            found, rates = _Step(program, *primals[:1], list(primals[1:])).differentiate(tangents[0], tangents[1:])
+        return tuple(_as_batched(program.motion(primals[1:]).qpos, x) for x in (found, rates))
+
+    run.defjvp(differentiated, symbolic_zeros=True)
+    moved, after = run(flight, *program.given)
+    return moved, eqx.tree_at(lambda x: x.held, jax.lax.stop_gradient(after), after.held)
+
+
+class _Program:
+    """The step and the rows of a model and its data, as functions of the leaves that only the running program knows.
+
+    What is known stays known, so that a step leaves out what a scene does not need. Functions are traced once for all uses.
+    """
+
+    def __init__(self, model: mjx.Model, data: mjx.Data):
+        self.model = model
+        self.leaves, self.form = jax.tree.flatten((model, data))
+        numbers = jax.tree.unflatten(self.form, range(len(self.leaves)))[1]
+        own, forces = set(taken(numbers)), {getattr(numbers, name) for name in _FORCES}
+        self.unknown = [i for i, x in enumerate(self.leaves) if i in own or isinstance(x, jax.core.Tracer)]
+        self.given = [self.leaves[i] for i in self.unknown]
+        self.places = Motion(*(self.unknown.index(i) for i in taken(numbers)))
+        self.moves_gaps = [i not in own and i not in forces for i in self.unknown]
+        self.step = jax.jit(lambda *given: advance(*self.all_of(given), Discrete()))
+        self.rows = jax.jit(lambda *given: _rows(*self.all_of(given)))
+
+    def all_of(self, given: Sequence[Any]) -> tuple[mjx.Model, mjx.Data]:
+        """Return model and data with these leaves."""
+        every = list(self.leaves)
+        for i, value in zip(self.unknown, given, strict=True):
+            every[i] = value
+        return jax.tree.unflatten(self.form, every)
+
+    def motion(self, given: Sequence[Any]) -> Motion:
+        return Motion(*(given[k] for k in self.places))
+
+    def put(self, given: Sequence[Any], motion: Motion) -> list[Any]:
+        """Return leaves with another motion."""
+        changed = list(given)
+        for k, value in zip(self.places, motion, strict=True):
+            changed[k] = value
+        return changed
+
+
 class _Near(NamedTuple):
-    """Contacts and limits: J, gaps, what counts as near, and when they are crossed."""
+    """Contacts and limits: J, gaps, and which may begin or end in the step, with what they span and when."""
 
     rows: Float[Array, "all nv"]
     gaps: Float[Array, " all"]
@@ -137,47 +179,8 @@ class _Near(NamedTuple):
     chosen: Bool[Array, " all"]
 
 
-def _gaps(blocks: list[Block]) -> Float[Array, " all"]:
-    return jnp.concatenate([block.residual[:: block.rows_each] for block in blocks])
-
-
-def _near(
-    model: mjx.Model, data: mjx.Data, blocks: list[Block], after: _Vector, lengths: np.ndarray
-) -> _Near:
-    h, dtype = model.opt.timestep, data.qvel.dtype
-    rows, solimp, blind = [], [], []
-    for block in blocks:
-        each = block.rows_each
-        entries = block.map.matrix(model.nv).reshape(-1, each, model.nv)
-        rows.append(jnp.mean(entries, axis=1) if block.is_pyramid else entries[:, 0])
-        solimp.append(block.solimp[::each])
-        if block.slots is None:
-            blind.append(jnp.zeros(len(entries), bool))
-        else:
-            slots, contacts = slot_geoms(model, data), slice(*block.slots)
-            geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
-            blind.append(jnp.asarray(is_blind(model, geoms)))
-    rows, solimp, blind, gaps = jnp.concatenate(rows), jnp.concatenate(solimp), jnp.concatenate(blind), _gaps(blocks)
-    rate = rows @ data.qvel
-    speed = jnp.maximum(jnp.abs(rate), jnp.abs(rows @ after))
-    centres, widths = jnp.zeros_like(gaps), 0.5 * h * speed
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        centres, widths = -0.5 * h * rate, _STAGES * widths
-    kept = 1 / (1 + h * model.dof_damping * model.dof_invweight0)
-    fall = h**2 * jnp.abs(rows @ (kept * data.qacc_smooth))
-    width = solimp[:, 2]
-    least = _LEAST_WIDTH * jnp.where(width > 0, jnp.minimum(width, _USUAL_WIDTH), _USUAL_WIDTH)
-    smallest = _SMALLEST if dtype == jnp.float64 else 10 * _SMALLEST
-    widths = jnp.maximum(widths, jnp.minimum(least, jnp.maximum(jnp.minimum(fall, _STIRRED * h * speed), smallest)))
-    jumps = (solimp[:, 0] > _NO_JUMP) & (jnp.sum((rows / lengths) ** 2, axis=1) > 1 / _FARTHEST**2)
-    inside = jnp.where(blind, (gaps < 0) & (gaps > -2 * widths), jnp.abs(gaps - centres) < widths)
-    is_met = jnp.abs(gaps) < h * jnp.abs(rate)
-    times = -jnp.where(is_met, gaps, 0.0) / jnp.where(is_met, rate, 1.0)
-    return _Near(rows, gaps, centres, widths, times, inside & jumps)
-
-
 class _Events(NamedTuple):
-    """Modes of events; see `engines.events.Events`."""
+    """Events by modes, as `engines.events.Events`; `is_one` says which are any, `weights` and `index` which rows have part."""
 
     is_one: Bool[Array, " modes"]
     rows: Float[Array, "modes nv"]
@@ -189,175 +192,301 @@ class _Events(NamedTuple):
     index: Int[Array, " events"]
 
 
-def _by_modes(near: _Near, is_contact: np.ndarray, lengths: np.ndarray, count: int) -> _Events:
-    """Return the chosen rows as modes, and displacements that change one alone and carry no other row across zero."""
-    dtype = near.rows.dtype
-    far = jnp.where(near.chosen, jnp.abs(near.gaps - near.centres) / near.widths, jnp.inf)
-    _, index = jax.lax.top_k(-far, count)
-    mask = near.chosen[index]
-    scaled = near.rows / jnp.asarray(lengths, dtype)
-    own = jnp.where(mask[:, None], scaled[index], 0.0)
-    moved = (own != 0) & jnp.asarray(is_contact)[index][:, None]
-    same = (moved.astype(dtype) @ moved.T.astype(dtype) > 0) | np.eye(count, dtype=bool)
-    for _ in range(int(np.ceil(np.log2(max(count, 2))))):
-        same = same.astype(dtype) @ same.astype(dtype) > 0
-    squares, left = jnp.linalg.eigh(jnp.where(same, own @ own.T, 0.0))
-    sizes, largest = jnp.sqrt(jnp.maximum(squares, 0.0)), jnp.max(jnp.abs(left), axis=0)
-    group = same[jnp.argmax(jnp.abs(left), axis=0)]  # modes events
-    is_one = largest * sizes > 1 / _FARTHEST
-    weights = jnp.where(group & is_one[:, None] & mask, (largest * left).T, 0.0)
-    widths = jnp.max(jnp.where(group & mask, near.widths[index], 0.0), axis=1)
-    mode = weights @ own
-    alike = group.astype(dtype) @ group.T.astype(dtype) > 0
-    to_middle = jnp.where(alike, (weights @ (near.centres - near.gaps)[index])[:, None], 0.0)
+class _Plan(NamedTuple):
+    """Which pairs go on, and which begin in which slot."""
 
-    def moves_of(rest: Array) -> Array:
-        gram = rest @ mode.T
-        scale = jnp.where(is_one, 0.0, 1.0)
-        return rest.T @ jnp.linalg.inv(gram + jnp.diag(scale))
-
-    moves = moves_of(mode)
-    reach = jnp.max(jnp.abs(scaled @ moves) * widths + jnp.abs(scaled @ (moves @ to_middle)), axis=1)
-    is_own = jnp.zeros(len(far), bool).at[index].max(mask)
-    margin = jnp.where((jnp.abs(near.gaps) < reach) & ~is_own, reach - jnp.abs(near.gaps), -1.0)
-    most, held = jax.lax.top_k(margin, count)
-    held = jnp.where(most[:, None] > 0, scaled[held], 0.0)
-    gram = held @ held.T
-    gram = gram + jnp.diag(jnp.where(most > 0, 1e-3 * jnp.diag(gram) + 1e-6, 1.0))
-    rest = mode - (mode @ held.T) @ jnp.linalg.solve(gram, held)
-    can_hold = jnp.all(~is_one | (jnp.sum(rest**2, axis=1) > 1 / _FARTHEST**2))
-    moves = jnp.where(can_hold, moves_of(jnp.where(can_hold, rest, mode)), moves)
-    by_coordinate = jnp.asarray(1 / lengths, dtype)[:, None]
-    return _Events(
-        is_one,
-        mode * jnp.asarray(lengths, dtype),
-        (weights * near.times[index]) @ near.rows[index],
-        moves * by_coordinate,
-        moves @ to_middle * by_coordinate,
-        widths,
-        weights,
-        index,
-    )
+    goes_on: Bool[Array, " slots"]
+    begins: Bool[Array, " slots"]
+    places: Float[Array, "slots modes"]
 
 
-def advance(model: mjx.Model, data: mjx.Data, flight: Flight, lengths: tuple[float, ...]) -> tuple[mjx.Data, Flight]:
-    """Take a motion, and what is in flight beside it, through a step of MuJoCo."""
-    leaves, tree = jax.tree.flatten((model, data, flight))
+class _Step:
+    """One step of a motion and of its pairs."""
 
-    @jax.custom_jvp
-    def run(*leaves):
-        model, data, flight = jax.tree.unflatten(tree, leaves)
-        return step(model, data), flight
+    def __init__(self, program: _Program, flight: Flight, given: list[Array]):
+        self.program, self.flight, self.given = program, flight, given
+        self.model, self.now = program.all_of(given)[0], program.motion(given)
+        self.nv, self.size, self.dtype = self.model.nv, flight.apart.shape[1], self.now.qvel.dtype
+        self.has_stages = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
-    def jvp(primals, tangents):
-        moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
+    def differentiate(self, given_flight: Flight, tangents: Sequence[Any]) -> tuple[Any, Any]:
+        """Return data and flight after the step, and the tangents of both."""
+        program, flight = self.program, self.flight
+        # Leaves, beside the motion, that have a tangent.
+        others = [k for k, x in enumerate(tangents) if k not in program.places and not isinstance(x, SymbolicZero)]
+        values, rates = [self.given[k] for k in others], [tangents[k] for k in others]
 
-        def along(*values):
-            every = [jax.lax.stop_gradient(x) for x in primals]
-            for i, value in zip(moving, values, strict=True):
-                every[i] = value
-            return _advance(*jax.tree.unflatten(tree, every), np.array(lengths))
+        def with_values(values: Sequence[Array]) -> list[Array]:
+            changed = list(self.given)
+            for k, value in zip(others, values, strict=True):
+                changed[k] = value
+            return changed
 
-        return jax.jvp(along, tuple(primals[i] for i in moving), tuple(tangents[i] for i in moving))
+        def moved_by(change: _Change, *values: Array) -> tuple[list[Array], mjx.Data]:
+            motion = _with_change(self.model, self.now, change)
+            found, rest = eqx.partition(program.step(*program.put(with_values(values), motion)), eqx.is_inexact_array)
+            return found, rest
 
-    run.defjvp(jvp, symbolic_zeros=True)
-    return run(*leaves)
+        found, along, rest = jax.linearize(moved_by, jnp.zeros(self.size, self.dtype), *values, has_aux=True)
+        moved = eqx.combine(found, rest)
+
+        def carried(change: _Change, common: tuple[Any, Array]) -> _Change:
+            """Return A times a change."""
+            along, qpos = common
+            return self._tangent(qpos, taken(along(change, *map(jnp.zeros_like, values))))
+
+        change = self._tangent(self.now.qpos, program.motion(tangents))
+        heard = _dense(given_flight.held, flight.held)
+        rows = program.rows(*self.given)
+        if rows is None:
+            return self._done(moved, flight, along(change, *rates), heard)
+        self.rows = rows
+        near = self._near(rows, moved.qvel)
+        modes = lambda near, lengths: self._by_modes(near, rows.is_contact, lengths)  # noqa: E731
+        events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), rows.lengths)
+        events = jax.tree.map(lambda x: x[0], events)
+        plan, reach = self._plan(events)
+        ends, widths, apart = self._go_on(events, plan)
+        is_alike = self._is_explained(events, plan, reach, apart, carried, (along, moved.qpos))
+        left = jnp.where(plan.begins, 2 if self.has_stages else _LONGEST, flight.left) - 1
+        alike = jnp.where(plan.begins | ~is_alike, 0, flight.alike + 1)
+        apart, plan, events = jax.tree.map(lambda x: checkpoint_name(x, SOLUTION), (apart, plan, events))
+        # All that follows is linear in tangents.
+        change = change + flight.apart.T @ jnp.where(plan.goes_on, 0.0, heard)
+        feels = events.rows @ change[: self.nv] + events.ahead @ change[self.nv : 2 * self.nv]
+        if moving := [k for k in others if program.moves_gaps[k]]:
+
+            def gaps(*values: Array) -> Float[Array, " all"]:
+                changed = list(self.given)
+                for k, value in zip(moving, values, strict=True):
+                    changed[k] = value
+                return program.rows(*changed).gaps
+
+            by_others = jax.jvp(gaps, [self.given[k] for k in moving], [tangents[k] for k in moving])[1]
+            feels = feels + events.weights @ by_others[events.index]
+        change = change.at[: self.nv].add(-events.moves @ feels)
+        heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels
+        after = Flight(ends, widths, left, alike, apart, flight.held)
+        return self._done(moved, after, along(change, *rates), heard)
+
+    def _done(self, moved: mjx.Data, flight: Flight, rates: mjx.Data, heard: Array) -> tuple[Any, Any]:
+        still = jax.tree.map(_no_tangent, (moved, flight))
+        rates = eqx.combine(rates, still[0])
+        return (moved, flight), (rates, eqx.tree_at(lambda x: x.held, still[1], heard))
+
+    def _tangent(self, qpos: Array, rates: Motion) -> _Change:
+        """Return the tangent of a motion in tangent space."""
+        by_position = jnp.zeros(self.nv, self.dtype)
+        if not isinstance(rates.qpos, SymbolicZero):
+            by_position = jax.jvp(lambda q: position_change(self.model, qpos, q), (qpos,), (rates.qpos,))[1]
+        return jnp.concatenate([by_position, _dense(rates.qvel, self.now.qvel), _dense(rates.act, self.now.act)])
+
+    def _scaled(self, change: Float[Array, "slots size"]) -> Float[Array, " slots"]:
+        """Return how large changes are (m)."""
+        lengths = self.rows.lengths
+        by_speed = _STEPS * self.model.opt.timestep * lengths
+        scale = jnp.concatenate([lengths, by_speed, jnp.zeros(self.size - 2 * self.nv, self.dtype)])
+        return jnp.linalg.norm(scale * change, axis=1)
+
+    def _near(self, every: "_Rows", after: _Vector) -> _Near:
+        """Return which contacts and limits may begin or end in the step, with the velocity after it."""
+        model, h, rows, gaps, solimp = self.model, self.model.opt.timestep, every.rows, every.gaps, every.solimp
+        rate = rows @ self.now.qvel
+        speed = jnp.maximum(jnp.abs(rate), jnp.abs(rows @ after))
+        centres, widths = jnp.zeros_like(gaps), 0.5 * h * speed
+        if self.has_stages:
+            centres, widths = -0.5 * h * rate, _STAGES * widths
+        kept = 1 / (1 + h * model.dof_damping * model.dof_invweight0)
+        fall = h**2 * jnp.abs(rows @ (kept * every.acceleration))
+        width = jnp.where(solimp[:, 2] > 0, jnp.minimum(solimp[:, 2], _USUAL_WIDTH), _USUAL_WIDTH)
+        smallest = _SMALLEST * (1.0 if self.dtype == jnp.float64 else _COARSER)
+        least = jnp.maximum(jnp.minimum(fall, _STIRRED * h * speed), smallest)
+        widths = jnp.maximum(widths, jnp.minimum(_LEAST_WIDTH * width, least))
+        jumps = (solimp[:, 0] > _NO_JUMP) & (jnp.sum((rows / every.lengths) ** 2, axis=1) > 1 / _FARTHEST**2)
+        # Without a distance outside, the step after the crossing meets it.
+        is_near = jnp.where(every.is_blind, (gaps < 0) & (gaps > -2 * widths), jnp.abs(gaps - centres) < widths)
+        is_met = jnp.abs(gaps) < h * jnp.abs(rate)
+        times = -jnp.where(is_met, gaps, 0.0) / jnp.where(is_met, rate, 1.0)
+        return _Near(rows, gaps, centres, widths, times, is_near & jumps)
+
+    def _by_modes(self, near: _Near, is_contact: tuple[bool, ...], lengths: _Vector) -> _Events:
+        """Return the nearest as modes, and displacements that change one mode alone and carry no other row across zero."""
+        count = min(len(self.flight.widths), len(near.gaps))
+        far = jnp.where(near.chosen, jnp.abs(near.gaps - near.centres) / near.widths, jnp.inf)
+        index = jax.lax.top_k(-far, count)[1]
+        is_event, scaled = near.chosen[index], near.rows / lengths
+        own = jnp.where(is_event[:, None], scaled[index], 0.0)
+        # Contacts that share coordinates, also by others between them, belong together.
+        shares = (own != 0) & jnp.asarray(np.array(is_contact))[index][:, None]
+        same = (shares[:, None] & shares).any(axis=2) | np.eye(count, dtype=bool)
+        for _ in range(math.ceil(math.log2(count))):
+            same = (same[:, :, None] & same).any(axis=1)
+        squares, left = jnp.linalg.eigh(jnp.where(same, own @ own.T, 0.0))
+        largest = jnp.max(jnp.abs(left), axis=0)
+        group = same[jnp.argmax(jnp.abs(left), axis=0)] & is_event  # of each mode
+        is_one = largest * jnp.sqrt(jnp.maximum(squares, 0.0)) > 1 / _FARTHEST
+        weights = jnp.where(group & is_one[:, None], (largest * left).T, 0.0)
+        widths = jnp.max(jnp.where(group, near.widths[index], 0.0), axis=1)
+        to_middle = weights @ (near.centres - near.gaps)[index]
+        to_middle = jnp.where((group[:, None] & group).any(axis=2), to_middle[:, None], 0.0)
+        mode = weights @ own
+
+        def moving(along: Array) -> Float[Array, "nv modes"]:
+            return along.T @ jnp.linalg.inv(along @ mode.T + jnp.diag(jnp.where(is_one, 0.0, 1.0)))
+
+        moves = moving(mode)
+        reach = jnp.max(jnp.abs(scaled @ moves) * widths + jnp.abs(scaled @ (moves @ to_middle)), axis=1)
+        over = jnp.where(jnp.zeros(len(far), bool).at[index].max(is_event), -1.0, reach - jnp.abs(near.gaps))
+        over, index_held = jax.lax.top_k(over, count)
+        held = jnp.where((over > 0)[:, None], scaled[index_held], 0.0)
+        gram = held @ held.T
+        gram = gram + jnp.diag(jnp.where(over > 0, _LOOSE * jnp.diag(gram), 1.0))
+        rest = mode - (mode @ held.T) @ jnp.linalg.solve(gram, held)
+        can_hold = jnp.all(~is_one | (jnp.sum(rest**2, axis=1) > 1 / _FARTHEST**2))
+        moves = jnp.where(can_hold, moving(jnp.where(can_hold, rest, mode)), moves) / lengths[:, None]
+        ahead = (weights * near.times[index]) @ near.rows[index]
+        return _Events(is_one, mode * lengths, ahead, moves, moves @ to_middle, widths, weights, index)
+
+    def _felt(self, events: _Events) -> Float[Array, "modes size"]:
+        rest = jnp.zeros((len(events.rows), self.size - 2 * self.nv), self.dtype)
+        return jnp.concatenate([events.rows, events.ahead, rest], axis=1)
+
+    def _plan(self, events: _Events) -> tuple[_Plan, Float[Array, "modes slots"]]:
+        """Return who goes on and who begins, and how far apart at each event pairs are."""
+        flight, is_one = self.flight, events.is_one
+        far = self._scaled(flight.apart)
+        is_known = flight.alike >= _NUM_ALIKE
+        goes_on = (flight.widths > 0) & (flight.left > 0) & ~(is_known & (far <= _FAR))
+        reach = jnp.abs(self._felt(events) @ flight.apart.T) * flight.widths
+        is_within = jnp.all(~is_one[:, None] | (reach <= 2 * events.widths[:, None]), axis=0) & jnp.any(is_one)
+        goes_on &= ~(is_known & is_within)
+        order = jnp.argsort(jnp.where(goes_on, far, -1.0))[: len(is_one)]
+        place = order[jnp.maximum(jnp.cumsum(is_one) - 1, 0)]
+        places = (place == jnp.arange(len(far))[:, None]) & is_one
+        begins = jnp.any(places, axis=1)
+        return _Plan(goes_on & ~begins, begins, places.astype(self.dtype)), reach
+
+    def _go_on(self, events: _Events, plan: _Plan) -> tuple[Motion, Array, Array]:
+        """Return both motions of all pairs after the step, how far apart they began, and D."""
+        model, flight = self.model, self.flight
+        shift = events.moves * events.widths
+        changes = jnp.stack([events.middles + shift, events.middles - shift])  # sides nv modes
+        changes = jnp.einsum("evm,sm->sev", changes, plan.places)
+        # A free slot repeats the motion.
+        started = jax.vmap(jax.vmap(lambda x: integrate_position(model, self.now.qpos, x, 1.0)))(changes)
+        goes_on = plan.goes_on[:, None, None]
+        fresh = Motion(started, self.now.qvel, self.now.act)
+        starts = Motion(*(jnp.where(goes_on, x, y) for x, y in zip(flight.ends, fresh, strict=True)))
+
+        def step(starts: Motion, given: list[Array]) -> Motion:
+            return jax.vmap(lambda motion: taken(self.program.step(*self.program.put(given, motion))))(starts)
+
+        ends = sparsely(step, plan.goes_on | plan.begins, starts, self.given)
+        widths = jnp.where(plan.goes_on, flight.widths, plan.places @ (2 * events.widths))
+        one, other = (jax.tree.map(lambda x, side=side: x[:, side], ends) for side in (0, 1))
+        by_position = jax.vmap(lambda x, y: position_change(model, y, x))(one.qpos, other.qpos)
+        apart = jnp.concatenate([by_position, one.qvel - other.qvel, one.act - other.act], axis=1)
+        is_sound = (widths > 0) & jnp.all(jnp.isfinite(apart), axis=1)
+        apart = jnp.where(is_sound[:, None], apart, 0.0) / jnp.where(is_sound, widths, 1.0)[:, None]
+        return ends, jnp.where(is_sound, widths, 0.0), apart
+
+    def _is_explained(
+        self, events: _Events, plan: _Plan, reach: Array, apart: Float[Array, "slots size"], carried: Any, common: Any
+    ) -> Bool[Array, " slots"]:
+        """Return whether the derivative along the motion says how pairs differ, but for events that lie between the two."""
+        before = self.flight.apart
+        felt = before @ self._felt(events).T  # slots modes
+        rest = before.at[:, : self.nv].add(-felt @ events.moves.T)
+        both = sparsely(jax.vmap(carried, (0, None)), plan.goes_on, jnp.stack([before, rest], axis=1), common)
+        plain, expected = jnp.swapaxes(both, 0, 1)
+        off = self._scaled(apart - expected - felt @ (plan.places.T @ apart))
+        is_beside = jnp.all(~events.is_one[:, None] | (reach <= 2 * _BESIDE * events.widths[:, None]), axis=0)
+        off = jnp.where(is_beside, jnp.minimum(off, self._scaled(apart - plain)), off)
+        return off <= _ALIKE * self._scaled(apart)
 
 
-def _put(data: mjx.Data, motion: Motion) -> mjx.Data:
-    return data.replace(qpos=motion.qpos, qvel=motion.qvel, act=motion.act)
+class _Rows(eqx.Module):
+    """All contacts and limits of a state.
+
+    Attributes:
+        rows: J of their normals.
+        gaps: distances less margins (m or rad).
+        solimp: of each.
+        is_blind: whose distance is known only where they overlap.
+        acceleration: of free motion.
+        lengths: how far each velocity moves the farthest point below it (m or 1).
+        is_contact: which are contacts, by themselves.
+    """
+
+    rows: Float[Array, "all nv"]
+    gaps: Float[Array, " all"]
+    solimp: Float[Array, "all 5"]
+    is_blind: Bool[Array, " all"]
+    acceleration: _Vector
+    lengths: _Vector
+    is_contact: tuple[bool, ...] = eqx.field(static=True)
 
 
-def _taken(data: mjx.Data) -> Motion:
-    return Motion(data.qpos, data.qvel, data.act)
-
-
-def _advance(model: mjx.Model, data: mjx.Data, flight: Flight, lengths: np.ndarray) -> tuple[mjx.Data, Flight]:
-    fixed, still, pairs = jax.lax.stop_gradient((model, data, flight))
-    nv, size, count, dtype = model.nv, flight.apart.shape[1], len(flight.widths), data.qvel.dtype
-    now = _taken(still)
-    h = fixed.opt.timestep
-    scale = jnp.concatenate([jnp.asarray(lengths), _STEPS * h * jnp.asarray(lengths), jnp.zeros(size - 2 * nv)])
-    scale = scale.astype(dtype)
-
-    def moved_by(change: Float[Array, " size"]) -> Motion:
-        return _taken(step(fixed, _put(still, _with_change(fixed, now, change))))
-
-    moved, along = jax.linearize(moved_by, jnp.zeros(size, dtype))
-
-    def tangent(change: Float[Array, " size"]) -> Float[Array, " size"]:
-        rates = along(change)
-        by_position = jax.jvp(lambda q: position_change(fixed, moved.qpos, q), (moved.qpos,), (rates.qpos,))[1]
-        return jnp.concatenate([by_position, rates.qvel, rates.act])
-
-    shown, blocks = _smooth(fixed, still)
+def _rows(model: mjx.Model, data: mjx.Data) -> _Rows | None:
+    """Return all contacts and limits of a state; None if the scene has none."""
+    data, blocks = smooth(model, data)
     blocks = [block for block in blocks if block.rows_each]
-    is_contact = np.concatenate([np.full(len(b.residual) // b.rows_each, b.slots is not None) for b in blocks])
-    near = _near(fixed, shown, blocks, moved.qvel, lengths)
-    events = _by_modes(near, is_contact, lengths, count)
-    felt = jnp.concatenate([events.rows, events.ahead, jnp.zeros((count, size - 2 * nv), dtype)], axis=1)
-
-    # Who is let go.
-    far = jnp.linalg.norm(scale * pairs.apart, axis=1)
-    known = pairs.alike >= _NUM_ALIKE
-    live = (pairs.widths > 0) & (pairs.left > 0) & ~(known & (far <= _FAR))
-    reach = jnp.abs(felt @ pairs.apart.T) * pairs.widths
-    is_within = jnp.all(~events.is_one[:, None] | (reach <= 2 * events.widths[:, None]), axis=0)
-    live &= ~(known & is_within & jnp.any(events.is_one))
-    # Places of those that begin: free slots, then those of pairs that are least apart.
-    order = jnp.argsort(jnp.where(live, far, -1.0))
-    rank = jnp.cumsum(events.is_one) - 1
-    place = (order[rank] == jnp.arange(count)[:, None]) & events.is_one  # slots modes
-    begins = jnp.any(place, axis=1)
-    live &= ~begins
-    place = place.astype(dtype)
-
-    # Both motions of all pairs, through this step.
-    shift = events.moves * events.widths
-    changes = jnp.stack([events.middles + shift, events.middles - shift], axis=1)  # nv 2 modes
-    changes = jnp.einsum("vem,sm->sev", changes, place)
-    started = jax.vmap(jax.vmap(lambda c: integrate_position(fixed, now.qpos, c, 1.0)))(changes)
-    choose = lambda new, old: jnp.where(begins.reshape(-1, *(1,) * (old.ndim - 1)), new, old)  # noqa: E731
-    is_used = begins | live
-    idle = lambda ends, own: jnp.where(is_used.reshape(-1, *(1,) * (ends.ndim - 1)), ends, own)  # noqa: E731
-    ends = Motion(*(idle(choose(new, old), new) for new, old in zip(
-        (started, jnp.broadcast_to(now.qvel, pairs.qvel.shape), jnp.broadcast_to(now.act, pairs.act.shape)),
-        (pairs.qpos, pairs.qvel, pairs.act), strict=True)))
-    ends = jax.vmap(jax.vmap(lambda motion: _taken(step(fixed, _put(still, motion)))))(ends)
-    widths = choose(place @ (2 * events.widths), pairs.widths) * is_used
-    apart = jax.vmap(lambda pair: _difference(fixed, jax.tree.map(lambda x: x[1], pair), jax.tree.map(lambda x: x[0], pair)))(ends)
-    apart = apart / jnp.where(widths > 0, widths, 1.0)[:, None]
-    is_sound = jnp.all(jnp.isfinite(apart), axis=1)
-    widths, apart = jnp.where(is_sound, widths, 0.0), jnp.where((widths > 0) & is_sound[..., None].squeeze(-1), apart.T, 0.0).T
-
-    # Does the derivative along the motion explain them?
-    by_felt = pairs.apart @ felt.T  # slots modes
-    kept = pairs.apart.at[:, :nv].add(-by_felt @ events.moves.T)
-    plain, clear = jax.vmap(tangent)(jnp.concatenate([pairs.apart, kept])).reshape(2, count, size)
-    off = jnp.linalg.norm(scale * (apart - clear - by_felt @ (place.T @ apart)), axis=1)
-    beside = jnp.linalg.norm(scale * (apart - plain), axis=1)
-    is_beside = jnp.all(~events.is_one[:, None] | (reach <= _BESIDE * 2 * events.widths[:, None]), axis=0)
-    off = jnp.where(is_beside, jnp.minimum(off, beside), off)
-    is_alike = off <= _ALIKE * jnp.linalg.norm(scale * apart, axis=1)
-    longest = 2 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else _LONGEST
-    left = jnp.where(begins, longest, pairs.left) - 1
-    alike = jnp.where(begins | ~is_alike, 0, pairs.alike + 1)
-
-    apart, live, place, events, before = jax.tree.map(
-        lambda x: checkpoint_name(x, SOLUTION), (apart, live, place, events, pairs.apart)
+    if not blocks:
+        return None
+    rows, blind = [], []
+    for block in blocks:
+        entries = block.map.matrix(model.nv).reshape(-1, block.rows_each, model.nv)
+        rows.append(jnp.mean(entries, axis=1) if block.is_pyramid else entries[:, 0])
+        blind.append(jnp.zeros(len(entries), bool))
+        if block.slots is not None:
+            slots, contacts = slot_geoms(model, data), slice(*block.slots)
+            blind[-1] |= is_blind(model, (data._impl.contact.geom if slots is None else slots)[contacts])
+    firsts = [(block.residual[:: block.rows_each], block.solimp[:: block.rows_each]) for block in blocks]
+    gaps, solimp = (jnp.concatenate(x) for x in zip(*firsts, strict=True))
+    kinds = tuple(
+        block.slots is not None for block, (own, _) in zip(blocks, firsts, strict=True) for _ in range(len(own))
     )
-    # What follows is differentiated.
-    start = _taken(data)
-    released = before.T @ jnp.where(live, 0.0, flight.held)
-    start = _with_change(model, start, released)
-    zero = _difference(fixed, now, start)
-    by_model = _gaps([b for b in _smooth(model, data.replace(qpos=now.qpos, qvel=now.qvel, act=now.act))[1] if b.rows_each])
-    by_model = (by_model - jax.lax.stop_gradient(by_model))[events.index]
-    feels = events.rows @ zero[:nv] + events.ahead @ zero[nv : 2 * nv] + events.weights @ by_model
-    feels = jnp.where(events.is_one, feels, 0.0)
-    start = start._replace(
-        qpos=_with_derivative_of(start.qpos, integrate_position(model, start.qpos, -events.moves @ feels, 1.0))
+    return _Rows(
+        jnp.concatenate(rows), gaps, solimp, jnp.concatenate(blind), data.qacc_smooth, _lengths(model, data), kinds
     )
-    end = step(model, _put(data, start))
-    held = jnp.where(live, flight.held, 0.0) + place @ feels
-    return end, Flight(*ends, widths, left, alike, apart, held)
+
+
+def _lengths(model: mjx.Model, data: mjx.Data) -> _Vector:
+    joints = model.dof_jntid
+    is_below = tree.moving_dofs(model)[model.geom_bodyid].astype(bool)
+    size = jnp.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 0.0, model.geom_rbound)
+    far = safe_norm(data.geom_xpos[:, None] - data.xanchor[joints]) + size[:, None]
+    lever = jnp.max(jnp.where(is_below, far, 0.0), axis=0, initial=_LEAST_LENGTH * model.stat.extent)
+    kinds, places = model.jnt_type[joints], np.arange(model.nv) - model.jnt_dofadr[joints]
+    is_straight = kinds == mujoco.mjtJoint.mjJNT_SLIDE
+    is_straight |= (kinds == mujoco.mjtJoint.mjJNT_FREE) & (places < 3)
+    return jnp.where(is_straight, 1.0, lever).astype(data.qvel.dtype)
+
+
+def _with_change(model: mjx.Model, motion: Motion, change: _Change) -> Motion:
+    """Return a motion, exactly, with the derivative of one to which a change of zero is added."""
+    by_position, by_speed, by_act = jnp.split(change, [model.nv, 2 * model.nv])
+    moved = integrate_position(model, motion.qpos, by_position, 1.0)
+    return with_derivative_of(motion, Motion(moved, motion.qvel + by_speed, motion.act + by_act))
+
+
+def _as_batched(qpos: Array, found: Any) -> Any:
+    """Return what was found, as batched as positions are: of `jax.custom_jvp` both function and rule must be so."""
+    is_any = qpos[0] == 0
+
+    def batched(x: Any) -> Any:
+        if x.dtype == jax.dtypes.float0:
+            return x
+        return jnp.where(is_any, x, x) if x.size else jnp.zeros(x.shape, x.dtype)
+
+    return jax.tree.map(batched, found)
+
+
+def _dense(tangent: Any, value: Array) -> Array:
+    return jnp.zeros_like(value) if isinstance(tangent, SymbolicZero) else tangent
+
+
+def _no_tangent(value: Array) -> Any:
+    if jnp.issubdtype(value.dtype, jnp.inexact):
+        return jnp.zeros_like(value)
+    return np.zeros(value.shape, jax.dtypes.float0)
