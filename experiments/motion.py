@@ -1,4 +1,4 @@
-"""One stepping loop for all experiments, a motion sampled at a few times in one program for every time step, and own tasks."""
+"""One stepping loop for all experiments, and own tasks."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,11 +23,6 @@ ARMS: dict[str, Contact] = {DISCRETE: mg.Discrete(), SLOPE: mg.Slope(), CONTINUO
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 
 
-def at_time_step(model: mjx.Model, timestep: ArrayLike) -> mjx.Model:
-    """Give a model with another time step, which may be traced."""
-    return model.tree_replace({"opt.timestep": jnp.asarray(timestep, model.opt.timestep.dtype)})  # pyright: ignore[reportReturnType]
-
-
 def advance(step: Callable[[mjx.Data], mjx.Data], data: mjx.Data, num_steps: Int[ArrayLike, ""]) -> mjx.Data:
     """Step many times, the state alone carried along; `mg.rollout` would compile anew for every number of steps.
 
@@ -39,27 +34,6 @@ def advance(step: Callable[[mjx.Data], mjx.Data], data: mjx.Data, num_steps: Int
         return {name: getattr(moved, name) for name in _STATE}
 
     return data.replace(**jax.lax.fori_loop(0, num_steps, once, {name: getattr(data, name) for name in _STATE}))
-
-
-def motion(
-    model: mjx.Model,
-    data: mjx.Data,
-    read: Read,
-    *,
-    num_times: int,
-    steps_between: Int[ArrayLike, ""],
-    contact: Contact,
-) -> Float[Array, "times *outcome"]:
-    """Read a motion at equal intervals, the first `steps_between` steps after the start; `contact` as in `ARMS`."""
-
-    def step(data: mjx.Data) -> mjx.Data:
-        return mg.step(model, data, contact=contact)
-
-    def until_next(moved: mjx.Data, _: None) -> tuple[mjx.Data, Array]:
-        moved = advance(step, moved, steps_between)
-        return moved, read(moved.qpos, moved.qvel)
-
-    return jax.lax.scan(until_next, data, length=num_times)[1]
 
 
 def own_task(settings: OwnScene, **others: Any) -> mg.SceneTask:

@@ -1,12 +1,12 @@
 """The sawtooth: outcomes of impacts and their derivatives over where within a time step the impact falls."""
 
+import copy
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import equinox as eqx
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,12 @@ from matplotlib.lines import Line2D
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, at_time_step, motion, own_task
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, own_task
 from experiments.report import Table
 from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots
 from experiments.words import joined, percent
 from experiments.workspace import Workspace
-from mjxgrad._mjx import mjx
 from mjxgrad.checking.sweep import Knob
 from mjxgrad.diagnostics import SlopeComparison, compare_to_slope, phases
 from mjxgrad.stepping import Gradient, own_motion
@@ -259,17 +258,25 @@ def _without_trend(
     return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(values.shape)
 
 
-@eqx.filter_jit
-def _sample(
-    model: mjx.Model, start: mjx.Data, parameters: Array, steps_between: Array, read: Read, moved: int, arm: str
-) -> tuple[Array, Array]:
-    """Give readings and derivatives; time steps differ in arrays alone, so one compilation serves them all."""
-    how = {"num_times": _NUM_TIMES, "steps_between": steps_between, "contact": ARMS[arm]}
+@functools.lru_cache(maxsize=1)
+def _by_mjx(name: str, horizon: int) -> Callable[..., tuple[Array, Array]]:
+    """Return readings and derivatives of rollouts by MJX, compiled once for all time steps."""
+    one = case(name)
+    scene, controls = mg.load_scene(one.model), jnp.zeros((horizon, one.model.nu))
 
-    def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
-        return motion(model, start.replace(qpos=start.qpos.at[moved].add(parameter)), read, **how)
+    def sample(
+        arm: str, timestep: Array, rows: Array, qpos: Array, qvel: Array, parameters: Array
+    ) -> tuple[Array, Array]:
+        own = scene.with_model(timestep=timestep)
 
-    return jax.vmap(lambda x: jax.jvp(simulate, (x,), (jnp.ones_like(x),)))(parameters)
+        def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
+            start = mg.initial_state(own, qpos.at[one.moved].add(parameter), qvel)
+            course = mg.rollout(own, start, controls, contact=ARMS[arm])
+            return jax.vmap(one.read)(course.qpos[rows], course.qvel[rows])
+
+        return jax.lax.map(lambda x: jax.jvp(simulate, (x,), (jnp.ones_like(x),)), parameters, batch_size=_TOGETHER)
+
+    return jax.jit(sample, static_argnums=0)
 
 
 def _by_mujoco(
@@ -311,25 +318,28 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
             return Outcome([_own_course(settings, workspace)])
     with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
         for number, name in enumerate(settings.cases):
-            own = float(case(name).model.opt.timestep)
-            for h in sorted({own, *settings.timesteps}, reverse=True):
+            one = case(name)
+            for h in sorted({float(one.model.opt.timestep), *settings.timesteps}, reverse=True):
                 courses.append(workspace.once(f"{name} {h}", lambda name=name, h=h: _course(name, h, settings)))
-                jax.clear_caches()  # no other motion takes its programs, and a process may have 65 530 pieces of memory
+            jax.clear_caches()  # no other motion takes its programs, and a process may have 65 530 pieces of memory
             advance_to(number + 1)
     return Outcome(courses)
 
 
+def _steps_between(one: Case, timestep: float) -> int:
+    return max(1, round(one.duration / timestep / _NUM_TIMES))
+
+
 def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     one = case(name)
-    scene = mg.load_scene(one.model)
-    qpos, qvel = np.array(scene.data.qpos), np.array(scene.data.qvel)
+    qpos, qvel = one.model.qpos0.copy(), np.zeros(one.model.nv)
     qpos[list(one.qpos)], qvel[list(one.qvel)] = list(one.qpos.values()), list(one.qvel.values())
-    start = scene.data.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
     # Neither evenly spaced nor of one length: teeth must not fall in step with the starts.
     parameters = phases(one.interval, settings.num_phases)
-    steps = max(1, round(one.duration / timestep / _NUM_TIMES))
+    steps = _steps_between(one, timestep)
+    horizon = _NUM_TIMES * _steps_between(one, min(one.model.opt.timestep, *settings.timesteps))
 
-    model = scene.to_mujoco()
+    model = copy.copy(one.model)
     model.opt.timestep = timestep
     arms = {}
     for arm in _ARMS:
@@ -338,8 +348,9 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
                 model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm], by_policy=arm == POLICY
             )
         else:
-            given = at_time_step(scene.model, timestep), start, jnp.asarray(parameters), jnp.int32(steps)
-            outcomes, derivatives = (np.asarray(each) for each in _sample(*given, one.read, one.moved, arm))
+            rows = steps * jnp.arange(1, _NUM_TIMES + 1)
+            given = (arm, timestep, rows, *map(jnp.asarray, (qpos, qvel, parameters)))
+            outcomes, derivatives = map(np.asarray, _by_mjx(name, horizon)(*given))
         arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
     reference = None
     if settings.reference:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,6 @@ from jaxtyping import Array, Bool, PyTree
 
 # Into how many parts a batch is divided, of which those are left out that nobody asks for; and the least part.
 _PARTS, _LEAST = 8, 8
-
-_Kind = Literal["each", "group", "common"]
 
 
 def sparsely(
@@ -38,11 +36,11 @@ def sparsely(
         every = [next(rest) if chosen else x for x, chosen in zip(leaves, is_given, strict=True)]
         return function(*jax.tree.unflatten(form, every))
 
-    kinds: list[_Kind] = ["each"] * num_each + ["common"] * (len(given) - num_each)
+    kinds = ["each"] * num_each + ["common"] * (len(given) - num_each)
     return _gathered(jax.jit(at), kinds)(is_wanted, *given)
 
 
-def _gathered(function: Callable, kinds: list[_Kind]) -> Callable:
+def _gathered(function: Callable, kinds: list[str]) -> Callable:
     """Return the same of a flat list of arrays: of each thing, of equal groups of them, and common to all."""
 
     @custom_vmap

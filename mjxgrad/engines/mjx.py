@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from typing import ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -18,8 +19,7 @@ from mjxgrad.engines.engine import Motion, Rows, one_each
 from mjxgrad.engines.state import State, Trajectory, data_of, direction, is_sound, state_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
-from mjxgrad.stepping import pairs
-from mjxgrad.stepping import Contact, Discrete, Onset, Slope, Smoothing, forward, step
+from mjxgrad.stepping import Contact, Discrete, Onset, Slope, Smoothing, forward, pairs, step
 from mjxgrad.stepping.onset import reach
 
 
@@ -41,10 +41,11 @@ class MJX:
         return (_roll_out if is_part else _roll_out_compiled)(motion, state, rows)
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
-        def advance(now: State, _: None) -> tuple[State, None]:
-            return state_of(step(scene.model, data_of(scene, now, ctrl), contact=contact)), None
+        def advance(now: _Moving, _: None) -> tuple[_Moving, None]:
+            return now.stepped(scene.model, data_of(scene, now.state, ctrl), contact)[1], None
 
-        return jax.lax.scan(advance, dataclasses.replace(state, pairs=None), None, length=num_steps)[0]
+        first = _Moving.at(scene, dataclasses.replace(state, pairs=None), contact)
+        return jax.lax.scan(advance, first, None, length=num_steps)[0].seen(scene.model)
 
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
@@ -66,35 +67,51 @@ class MJX:
         return of_state[:, :size], of_state[:, size:], of_sensors[:, :size], of_sensors[:, size:]
 
 
-class _Carry(NamedTuple):
-    """The carry of the scan: the last good state, what to count as in `Trajectory`, and the tangent that measures growth.
-
-    `before` is the previous control, under which a policy observes; None for a policy that sees the state.
-    """
+class _Moving(eqx.Module):
+    """A state, and what is in flight beside it where a slope is asked for; see `stepping.pairs`."""
 
     state: State
     flight: pairs.Flight | None
+
+    @staticmethod
+    def at(scene: Scene, state: State, contact: Contact) -> "_Moving":
+        return _Moving(state, pairs.no_flight(scene.model, scene.data) if isinstance(contact, Slope) else None)
+
+    def seen(self, model: mjx.Model) -> State:
+        """Return the state with its whole derivative."""
+        if self.flight is None:
+            return self.state
+        own = pairs.Motion(self.state.qpos, self.state.qvel, self.state.act)
+        return dataclasses.replace(self.state, **pairs.whole(model, own, self.flight)._asdict())
+
+    def stepped(self, model: mjx.Model, data: mjx.Data, contact: Contact) -> tuple[mjx.Data, "_Moving"]:
+        """Return the data after a step from data of this state, and the next of these."""
+        if self.flight is None:
+            data, flight = step(model, data, contact=contact), None
+        else:
+            data, flight = pairs.follow(model, data, self.flight)
+        return data, _Moving(state_of(data), flight)
+
+
+class _Carry(NamedTuple):
+    """The carry of the scan: the last good state, what to count as in `Trajectory`, and a tangent that measures growth.
+
+    `before` is the previous control, under which a policy observes; None for a policy that sees the state. `watched` moves as
+    the state does; its tangent is followed, and nothing is differentiated by it.
+    """
+
+    moving: _Moving
     before: Array | None
     first_bad: Array
     unsolved: Array
     crowded: Array
-    tangent: tuple[Array, Array] | None
+    watched: _Moving | None
+    tangent: tuple[Array, ...] | None
     growth: Array | None
 
 
 class _Scan(Motion):
     """The loop over the steps of one rollout."""
-
-    @property
-    def follows(self) -> bool:
-        return isinstance(self.contact, Slope) and pairs.NUM_SLOTS > 0 and not self.measure_growth
-
-    def whole(self, carry: _Carry) -> State:
-        state = carry.state
-        if carry.flight is None:
-            return state
-        seen = pairs.whole(self.scene.model, pairs.Motion(state.qpos, state.qvel, state.act), carry.flight)
-        return dataclasses.replace(state, **seen._asdict())
 
     def begin(self, state: State) -> _Carry:
         """Return the carry of the first step."""
@@ -102,60 +119,65 @@ class _Scan(Motion):
         # A NaN in the contacts of a traced model would go unnoticed.
         traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
+        moving = _Moving.at(self.scene, dataclasses.replace(state, pairs=None), self.contact)
+        watched = jax.lax.stop_gradient(moving) if self.measure_growth else None
         return _Carry(
-            dataclasses.replace(state, pairs=None),
-            pairs.no_flight(self.scene.model, self.scene.data) if self.follows else None,
+            moving,
             self.scene.data.ctrl if looks else None,
             jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)),
             jnp.zeros((), jnp.int32),
             jnp.zeros((), jnp.int32),
-            direction(state) if self.measure_growth else None,
-            jnp.ones((), state.qvel.dtype) if self.measure_growth else None,
+            watched,
+            None if watched is None else (*direction(state), *_held(watched)),
+            None if watched is None else jnp.ones((), state.qvel.dtype),
         )
 
     def advance(self, carry: _Carry, given: tuple[Array, Rows]) -> tuple[_Carry, tuple]:
         """Take one step, and return the next carry and the outputs of this step."""
-        state, model = self.whole(carry), self.scene.model
-        flight = carry.flight
+        model = self.scene.model
+        state = carry.moving.seen(model)
         index, rows = given
         row, disturbance, forces = rows.controls, rows.noise, rows.inputs
         seen = None if carry.before is None else self.look(state, carry.before, forces)
         if self.policy is not None:
             row = one_each(self.policy(self.params, state if carry.before is None else seen), model.nu)
         ctrl = row + disturbance
-        data = data_of(self.scene, carry.state, ctrl).replace(**forces)
-        tangent, growth = carry.tangent, carry.growth
-        if flight is not None:
-            stepped, flight = pairs.follow(model, data, flight)
-        elif tangent is None or growth is None:
-            stepped = step(model, data, contact=self.contact)
-        else:
-            stepped, tangent, growth = self.measure(data, tangent, growth)
-        moved = state_of(stepped)
-        is_bad = ~is_sound(moved.qpos, moved.qvel, moved.act)
+        data = data_of(self.scene, carry.moving.state, ctrl).replace(**forces)
+        stepped, moving = carry.moving.stepped(model, data, self.contact)
+        is_bad = ~is_sound(*(getattr(moving.state, name) for name in ("qpos", "qvel", "act")))
         first_bad = jnp.where((carry.first_bad < 0) & is_bad, index, carry.first_bad)
+        watched, tangent, growth = self.measure(carry, data)
         following = _Carry(
-            jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), carry.state, moved),
-            flight,
+            jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), carry.moving, moving),
             None if carry.before is None else ctrl.astype(carry.before.dtype),
             first_bad,
             carry.unsolved + ((first_bad < 0) & (stepped._impl.solver_niter > model.opt.iterations)),
             carry.crowded + ((first_bad < 0) & _is_crowded(model, jax.lax.stop_gradient(stepped), self.contact)),
+            watched,
             tangent,
             growth,
         )
-        return following, (state.qpos, state.qvel, state.act, ctrl, self.look(state, ctrl, forces, None if flight is not None else stepped), seen)
+        # A step's data has the derivative along the motion alone.
+        observed = self.look(state, ctrl, forces, None if moving.flight is not None else stepped)
+        return following, (state.qpos, state.qvel, state.act, ctrl, observed, seen)
 
-    def measure(self, data: mjx.Data, tangent: tuple, growth: Array) -> tuple[mjx.Data, tuple[Array, Array], Array]:
-        """Return the data after a step, the tangent there, and its largest norm so far."""
+    def measure(self, carry: _Carry, data: mjx.Data) -> tuple[_Moving | None, tuple | None, Array | None]:
+        """Return what is watched after a step from data, its tangent there, and the largest norm of that so far."""
+        if carry.watched is None or carry.tangent is None or carry.growth is None:
+            return None, None, None
+        model, data, watched = jax.lax.stop_gradient((self.scene.model, data, carry.watched))
 
-        def motion(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], mjx.Data]:
-            stepped = step(self.scene.model, data.replace(qpos=qpos, qvel=qvel), contact=self.contact)
-            return (stepped.qpos, stepped.qvel), stepped
+        def motion(qpos: Array, qvel: Array, *held: Array) -> tuple[tuple, _Moving]:
+            flight = watched.flight if not held else eqx.tree_at(lambda x: x.held, watched.flight, held[0])
+            after = _Moving(watched.state, flight).stepped(model, data.replace(qpos=qpos, qvel=qvel), self.contact)[1]
+            seen = after.seen(model)
+            return ((after.state.qpos, after.state.qvel, *_held(after)), (seen.qpos, seen.qvel)), after
 
-        _, change, stepped = jax.jvp(motion, (data.qpos, data.qvel), tangent, has_aux=True)
-        change = jax.lax.stop_gradient(change)
-        return stepped, change, jnp.maximum(growth, jnp.linalg.norm(jnp.concatenate(change)))  # a NaN stays one
+        _, (change, whole), after = jax.jvp(
+            motion, (data.qpos, data.qvel, *_held(watched)), carry.tangent, has_aux=True
+        )
+        growth = jnp.maximum(carry.growth, jnp.linalg.norm(jnp.concatenate(whole)))  # a NaN stays one
+        return after, change, growth
 
     def look(self, state: State, ctrl: Array, forces: dict, stepped: mjx.Data | None = None) -> PyTree:
         """Return the observations in a state under a control, from the data of a step where it is given."""
@@ -169,6 +191,10 @@ class _Scan(Motion):
         return self.observe(model, stepped.replace(**at_start))
 
 
+def _held(moving: _Moving) -> tuple[Array, ...]:
+    return () if moving.flight is None else (moving.flight.held,)
+
+
 def _roll_out(motion: Motion, state: State, rows: Rows) -> Trajectory:
     scan = _Scan(**{field.name: getattr(motion, field.name) for field in dataclasses.fields(motion)})
     advance = functools.partial(_Scan.advance, scan)  # a bound method of a pytree has no hash
@@ -178,7 +204,7 @@ def _roll_out(motion: Motion, state: State, rows: Rows) -> Trajectory:
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     first, steps = scan.begin(state), jnp.arange(len(rows.controls), dtype=jnp.int32)
     end, (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(advance, first, (steps, rows))
-    final, growth = scan.whole(end), end.growth
+    final, growth = end.moving.seen(scan.scene.model), end.growth
     if scan.observe is not None:
         last = scan.look(final, ctrl[-1], jax.tree.map(lambda x: x[-1], rows.inputs))
         observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)

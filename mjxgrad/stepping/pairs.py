@@ -8,7 +8,7 @@ motions at a time.
 Of a pair, D is the difference of its two motions over how far apart they began, and h what its event has felt of a change. The
 change of a state is that along the motion, x, and of all pairs together:
 
-    whole = x + Σ D h,        x' = A (1 - P L) x + B u,        h' = h;  h' = L x where a pair begins;  x += D h where one is let go.
+    whole = x + Σ D h,    x' = A (1 - P L) x + B u,    h' = h, or L x where a pair begins,    x += D h where one is let go.
 
 h is carried as a zero that has a derivative, and D, P and L are constants to it. So forward and reverse mode of this program are
 the rule; the motions of pairs are stepped, not differentiated. Where nothing is differentiated, no pair begins.
@@ -42,7 +42,6 @@ from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import is_blind, slot_geoms
 from mjxgrad.stepping.contact import Discrete
 from mjxgrad.stepping.forward import advance, at_full_precision, smooth
-from mjxgrad.stepping.rows import Block
 
 NUM_SLOTS = 4
 # These are as in `engines.events` and `engines.flight`.
@@ -124,7 +123,7 @@ def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, 
 
     def differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
         with at_full_precision(model, data):
-            found, rates = _Step(program, *primals[:1], list(primals[1:])).differentiate(tangents[0], tangents[1:])
+            found, rates = _Step(program, primals[0], list(primals[1:])).differentiate(tangents[0], tangents[1:])
         return tuple(_as_batched(program.motion(primals[1:]).qpos, x) for x in (found, rates))
 
     run.defjvp(differentiated, symbolic_zeros=True)
@@ -142,11 +141,11 @@ class _Program:
         self.model = model
         self.leaves, self.form = jax.tree.flatten((model, data))
         numbers = jax.tree.unflatten(self.form, range(len(self.leaves)))[1]
-        own, forces = set(taken(numbers)), {getattr(numbers, name) for name in _FORCES}
-        self.unknown = [i for i, x in enumerate(self.leaves) if i in own or isinstance(x, jax.core.Tracer)]
+        moving, forces = (numbers.qpos, numbers.qvel, numbers.act), {getattr(numbers, name) for name in _FORCES}
+        self.unknown = [i for i, x in enumerate(self.leaves) if i in moving or isinstance(x, jax.core.Tracer)]
         self.given = [self.leaves[i] for i in self.unknown]
-        self.places = Motion(*(self.unknown.index(i) for i in taken(numbers)))
-        self.moves_gaps = [i not in own and i not in forces for i in self.unknown]
+        self.places = tuple(self.unknown.index(i) for i in moving)
+        self.moves_gaps = [i not in moving and i not in forces for i in self.unknown]
         self.step = jax.jit(lambda *given: advance(*self.all_of(given), Discrete()))
         self.rows = jax.jit(lambda *given: _rows(*self.all_of(given)))
 
@@ -180,7 +179,7 @@ class _Near(NamedTuple):
 
 
 class _Events(NamedTuple):
-    """Events by modes, as `engines.events.Events`; `is_one` says which are any, `weights` and `index` which rows have part."""
+    """Events by modes, as `engines.events.Events`; `is_one` says which are any, `weights` and `chosen` which rows take part."""
 
     is_one: Bool[Array, " modes"]
     rows: Float[Array, "modes nv"]
@@ -189,7 +188,7 @@ class _Events(NamedTuple):
     middles: Float[Array, "nv modes"]
     widths: Float[Array, " modes"]
     weights: Float[Array, "modes events"]
-    index: Int[Array, " events"]
+    chosen: Int[Array, " events"]
 
 
 class _Plan(NamedTuple):
@@ -263,7 +262,7 @@ class _Step:
                 return program.rows(*changed).gaps
 
             by_others = jax.jvp(gaps, [self.given[k] for k in moving], [tangents[k] for k in moving])[1]
-            feels = feels + events.weights @ by_others[events.index]
+            feels = feels + events.weights @ by_others[events.chosen]
         change = change.at[: self.nv].add(-events.moves @ feels)
         heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels
         after = Flight(ends, widths, left, alike, apart, flight.held)
