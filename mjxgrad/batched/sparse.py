@@ -48,8 +48,10 @@ def _gathered(function: Callable, kinds: list[str]) -> Callable:
         count = len(is_wanted)
         groups = next((len(x) for x, kind in zip(leaves, kinds, strict=True) if kind == "group"), 1)
         size = min(count, max(_LEAST, math.ceil(count / _PARTS)))
-        order = jnp.argsort(~is_wanted, stable=True)
-        order = jnp.append(order, jnp.full(-count % size, count, order.dtype))
+        every = jnp.arange(count, dtype=jnp.int32)
+        order = jnp.full(size * math.ceil(count / size), count, jnp.int32)
+        place = jnp.where(is_wanted, jnp.cumsum(is_wanted, dtype=jnp.int32) - 1, len(order))
+        order = order.at[place].set(every, mode="drop")
         own = jax.vmap(function, [None if kind == "common" else 0 for kind in kinds])
 
         def part(first: Array) -> tuple[Array, PyTree]:
