@@ -1,11 +1,12 @@
 """Functions of few of many: what is not asked for takes no time, also where a batch is stepped together."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, PyTree
 
@@ -44,7 +45,7 @@ def _gathered(function: Callable, kinds: list[str]) -> Callable:
     """Return the same of a flat list of arrays: of each thing, of equal groups of them, and common to all."""
 
     @custom_vmap
-    def run(is_wanted: Bool[Array, " n"], *leaves: Array) -> PyTree:
+    def run(is_wanted: Array | np.ndarray, *leaves: Array | np.ndarray) -> PyTree:
         count = len(is_wanted)
         groups = next((len(x) for x, kind in zip(leaves, kinds, strict=True) if kind == "group"), 1)
         size = min(count, max(_LEAST, math.ceil(count / _PARTS)))
@@ -74,7 +75,9 @@ def _gathered(function: Callable, kinds: list[str]) -> Callable:
         return jax.lax.while_loop(lambda state: state[0] < wanted, go_on, (jnp.int32(0), found))[1]
 
     @run.def_vmap
-    def _(size: int, is_batched: list, is_wanted: Array, *leaves: Array) -> tuple[PyTree, PyTree]:
+    def _(
+        size: int, is_batched: Sequence[bool], is_wanted: Array | np.ndarray, *leaves: Array | np.ndarray
+    ) -> tuple[PyTree, PyTree]:
         groups = next(
             (jnp.shape(x)[b] for x, kind, b in zip(leaves, kinds, is_batched[1:], strict=True) if kind == "group"), 1
         )

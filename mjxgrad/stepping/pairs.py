@@ -221,7 +221,7 @@ class _Step:
                 changed[k] = value
             return changed
 
-        def moved_by(change: _Change, *values: Array) -> tuple[list[Array], mjx.Data]:
+        def moved_by(change: _Change, *values: Array) -> tuple[mjx.Data, mjx.Data]:
             motion = _with_change(self.model, self.now, change)
             found, rest = eqx.partition(program.step(*program.put(with_values(values), motion)), eqx.is_inexact_array)
             return found, rest
