@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -15,11 +16,12 @@ from mjxgrad._programs import compiled, is_traced
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import first_missed, slot_geoms
+from mjxgrad.engines.agreement import parting
 from mjxgrad.engines.engine import Motion, Rows, one_each
 from mjxgrad.engines.state import State, Trajectory, data_of, direction, is_sound, state_of
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
-from mjxgrad.stepping import Contact, Discrete, Onset, Slope, Smoothing, forward, pairs, step
+from mjxgrad.stepping import Contact, Discrete, Onset, OwnMotion, Slope, Smoothing, forward, pairs, step
 from mjxgrad.stepping.onset import reach
 
 
@@ -37,8 +39,12 @@ class MJX:
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
         # Functions may read changing variables: every call traces them anew, unless the caller compiles.
         has_functions = motion.policy is not None or motion.observe is not None
-        is_part = has_functions or is_traced((motion, state, rows))
-        return (_roll_out if is_part else _roll_out_compiled)(motion, state, rows)
+        is_known = not is_traced((motion, state, rows))
+        found = (_roll_out_compiled if is_known and not has_functions else _roll_out)(motion, state, rows)
+        is_own = isinstance(motion.contact, OwnMotion) and is_known and not is_traced(found)
+        if is_own and (message := parting(motion.scene, found, rows.inputs)):
+            warnings.warn(f"{motion.scene.name}: {message}", SceneWarning, stacklevel=3)
+        return found
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
         def advance(now: _Moving, _: None) -> tuple[_Moving, None]:
