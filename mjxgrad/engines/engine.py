@@ -60,8 +60,8 @@ class Engine(Protocol):
     compiles: ClassVar[bool]
     steers: ClassVar[bool]
 
-    def complete(self, scene: Scene, state: State) -> State:
-        """Return a state with all that this engine goes on with."""
+    def complete(self, scene: Scene, state: State, contact: Contact) -> State:
+        """Return a state with all that this engine goes on with from one rollout to the next."""
         ...
 
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:

@@ -33,8 +33,9 @@ class MJX:
     compiles: ClassVar[bool] = True
     steers: ClassVar[bool] = False
 
-    def complete(self, scene: Scene, state: State) -> State:
-        return state
+    def complete(self, scene: Scene, state: State, contact: Contact) -> State:
+        is_followed = isinstance(contact, Slope) and not isinstance(state.pairs, pairs.Flight)
+        return dataclasses.replace(state, pairs=pairs.no_flight(scene.model, scene.data)) if is_followed else state
 
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
         # Functions may read changing variables: every call traces them anew, unless the caller compiles.
@@ -50,8 +51,8 @@ class MJX:
         def advance(now: _Moving, _: None) -> tuple[_Moving, None]:
             return now.stepped(scene.model, data_of(scene, now.state, ctrl), contact)[1], None
 
-        first = _Moving.at(scene, dataclasses.replace(state, pairs=None), contact)
-        return jax.lax.scan(advance, first, None, length=num_steps)[0].seen(scene.model)
+        first = _Moving.at(scene, state, contact)
+        return jax.lax.scan(advance, first, None, length=num_steps)[0].end(scene.model, state)
 
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
@@ -81,7 +82,14 @@ class _Moving(eqx.Module):
 
     @staticmethod
     def at(scene: Scene, state: State, contact: Contact) -> "_Moving":
-        return _Moving(state, pairs.no_flight(scene.model, scene.data) if isinstance(contact, Slope) else None)
+        """Return a state that may have pairs in flight; its derivative is then that of all."""
+        alone = dataclasses.replace(state, pairs=None)
+        if not isinstance(contact, Slope):
+            return _Moving(alone, None)
+        if not isinstance(state.pairs, pairs.Flight):
+            return _Moving(alone, pairs.no_flight(scene.model, scene.data))
+        own = pairs.without(scene.model, pairs.Motion(state.qpos, state.qvel, state.act), state.pairs)
+        return _Moving(dataclasses.replace(alone, **own._asdict()), state.pairs)
 
     def seen(self, model: mjx.Model) -> State:
         """Return the state with its whole derivative."""
@@ -89,6 +97,12 @@ class _Moving(eqx.Module):
             return self.state
         own = pairs.Motion(self.state.qpos, self.state.qvel, self.state.act)
         return dataclasses.replace(self.state, **pairs.whole(model, own, self.flight)._asdict())
+
+    def end(self, model: mjx.Model, given: State) -> State:
+        """Return the state with its whole derivative, and pairs in flight where the given one has some."""
+        is_kept = isinstance(given.pairs, pairs.Flight)
+        kept = given.pairs if is_kept and self.flight is None else self.flight
+        return dataclasses.replace(self.seen(model), pairs=kept if is_kept else None)
 
     def stepped(self, model: mjx.Model, data: mjx.Data, contact: Contact) -> tuple[mjx.Data, "_Moving"]:
         """Return the data after a step from data of this state, and the next of these."""
@@ -125,7 +139,7 @@ class _Scan(Motion):
         # A NaN in the contacts of a traced model would go unnoticed.
         traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
-        moving = _Moving.at(self.scene, dataclasses.replace(state, pairs=None), self.contact)
+        moving = _Moving.at(self.scene, state, self.contact)
         watched = jax.lax.stop_gradient(moving) if self.measure_growth else None
         return _Carry(
             moving,
@@ -210,7 +224,7 @@ def _roll_out(motion: Motion, state: State, rows: Rows) -> Trajectory:
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     first, steps = scan.begin(state), jnp.arange(len(rows.controls), dtype=jnp.int32)
     end, (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(advance, first, (steps, rows))
-    final, growth = end.moving.seen(scan.scene.model), end.growth
+    final, growth = end.moving.end(scan.scene.model, state), end.growth
     if scan.observe is not None:
         last = scan.look(final, ctrl[-1], jax.tree.map(lambda x: x[-1], rows.inputs))
         observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)

@@ -37,13 +37,13 @@ class MuJoCo:
     compiles: ClassVar[bool] = False
     steers: ClassVar[bool] = True
 
-    def complete(self, scene: Scene, state: State) -> State:
+    def complete(self, scene: Scene, state: State, contact: Contact = Slope()) -> State:
         """Return a state with histories as they are at first, and no pairs, unless it has some."""
         pool, dtype = pool_of(scene.mj_model), state.qpos.dtype
         first = np.concatenate([pool.first[name] for name in MOTION[3:]])
         history = state.history if state.history.size == first.size else jnp.asarray(first, dtype)
         nothing = [jnp.zeros(shape, dtype) for shape in (pool.flight_shape, pool.flight_shape[:1])]
-        pairs = Pairs(*nothing) if state.pairs is None else state.pairs
+        pairs = state.pairs if isinstance(state.pairs, Pairs) else Pairs(*nothing)
         return dataclasses.replace(state, history=history, pairs=pairs)
 
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from mjxgrad._arrays import instance
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import Scene
+from mjxgrad.stepping.pairs import Flight
 
 VELOCITY_LIMIT = 1e4  # m/s or rad/s, beyond which a rollout counts as diverged
 LARGEST_GROWTH = 1e3
@@ -38,7 +39,7 @@ class State(eqx.Module):
         time: simulated time (s).
         warmstart: acceleration at which the next solve starts. It affects the solve's duration, not its result.
         history: past controls and readings, of delays, and states of plugins; as MuJoCo keeps them.
-        pairs: pairs of motions that a slope by C MuJoCo follows; None where MJX steps the scene.
+        pairs: pairs of motions that a slope follows, as its engine keeps them. None: they are let go at the end of a rollout.
     """
 
     qpos: Float[Array, " nq"]
@@ -47,7 +48,7 @@ class State(eqx.Module):
     time: Float[Array, ""]
     warmstart: Float[Array, " nv"]
     history: Float[Array, " nhistory"] = eqx.field(default_factory=lambda: jnp.zeros(0))
-    pairs: Pairs | None = None
+    pairs: Pairs | Flight | None = None
 
 
 class Trajectory(eqx.Module):

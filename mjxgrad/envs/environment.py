@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import instance, one_key, real, whole
+from mjxgrad.engines import engine_of
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -147,6 +148,7 @@ class Environment(InScene):
         one_key(key)
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
+        physics = engine_of(self.scene, self.contact).complete(self.scene, physics, self.contact)
         obs = self.observe(physics, memory)
         action = jnp.zeros(self.num_actions, obs.dtype)
         terms = jax.eval_shape(lambda: self.rewards(physics, action, physics, memory))

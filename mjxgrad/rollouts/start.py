@@ -14,6 +14,7 @@ from mjxgrad.contact.parameters import geom_name
 from mjxgrad.engines import engine_of
 from mjxgrad.engines.state import State, check_scene
 from mjxgrad.scene import Scene, SceneWarning
+from mjxgrad.stepping import Discrete
 
 _HARMLESS = 0.01  # share of its range by which a joint may begin beyond it
 _DEEP = 0.02  # m, largest penetration of a pose without a warning
@@ -53,7 +54,7 @@ def initial_state(
     for message in pose_warnings(scene.model, scene.mj_model if qpos is None else None, parts[0]):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     state = State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
-    return engine_of(scene).complete(scene, state)
+    return engine_of(scene).complete(scene, state, Discrete())
 
 
 def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:

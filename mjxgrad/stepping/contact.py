@@ -55,8 +55,8 @@ class Discrete(OwnMotion):
 class Slope(OwnMotion):
     """MuJoCo's own motion, with the derivative whose mean is the slope of the outcome; see `OwnMotion`.
 
-    It includes the moving times of contact and limit events: along MuJoCo's motion, it is the derivative of a step with an
-    onset. See `engines.events` for C MuJoCo.
+    It knows that a change moves the times of contact and limit events. Both engines have it by the same rule: `engines.events`
+    and `engines.flight` say which, `stepping.pairs` has it for MJX.
     """
 
     gradient = "slope"

@@ -99,6 +99,11 @@ def whole(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
     return _with_change(model, motion, jax.lax.stop_gradient(flight.apart).T @ flight.held)
 
 
+def without(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
+    """Return a motion without the derivative of what is in flight beside it; the inverse of `whole`."""
+    return _with_change(model, motion, -jax.lax.stop_gradient(flight.apart).T @ flight.held)
+
+
 def taken(data: mjx.Data) -> Motion:
     """Return what moves of data."""
     return Motion(data.qpos, data.qvel, data.act)

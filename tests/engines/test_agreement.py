@@ -35,9 +35,7 @@ def test_the_joint_that_moves_otherwise_is_named_once():
     scene, other = mg.load_scene(BOX), copy.copy(mujoco.MjModel.from_xml_string(BOX))
     other.geom_contype[:] = other.geom_conaffinity[:] = 0
     scene = dataclasses.replace(scene, mj_model=other)
-    with pytest.warns(
-        SceneWarning, match=r"step \d+ by MJX is not C MuJoCo's: up has a speed of .* engine='mujoco'"
-    ):
+    with pytest.warns(SceneWarning, match=r"step \d+ by MJX is not C MuJoCo's: up has a speed of .* engine='mujoco'"):
         _roll(scene)
     with warnings.catch_warnings(action="error"):
         _roll(scene)
