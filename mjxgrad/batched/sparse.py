@@ -22,10 +22,10 @@ def sparsely(
     Under `jax.vmap` the wanted ones of the whole batch are gathered, so that time goes with their number.
 
     Args:
-        function: of one thing and of what is common to all; it returns a tree of arrays.
+        function: a function of one thing and of the common part; it returns a tree of arrays.
         is_wanted: where its result is wanted.
         each: the things, with an axis of n in front of all arrays.
-        common: what they share; it may be batched.
+        common: a tree that all share; it may be batched.
     """
     leaves, form = jax.tree.flatten((each, common))
     num_each = len(jax.tree.leaves(each))

@@ -60,18 +60,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-_LEAST_WIDTH = 0.06  # of the impedance's width
-_STIRRED = 4.0  # steps of travel, beyond which a surface is not near
-_SMALLEST = 1e-6  # half of what is spanned (m or rad)
+from mjxgrad.stepping import slope
+
 HAIR = 6e-5
 """How far surfaces are moved to average the geometry of contacts (m)."""
 _LARGEST_TURN = 0.02  # rad, of the smallest bodies
 _NOTHING = 1e-30
-_STAGES = 1.2  # travels that a window of Runge-Kutta spans: with 1 a tenth is missed on hoppers, with 2 the mean is further off
-_NO_JUMP = 0.01  # impedance from which force begins without a jump worth the name, so that small differences see it all
-_USUAL_WIDTH = 1e-3  # m or rad; wider impedances, of soft limits, reach states that come to no surface
-# Rows count as independent if nothing need move farther than so many times the gap to change one alone.
-_FARTHEST = 10.0
 _ROUNDING = 1e-9  # m or rad, of gaps
 _SMOOTH = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
 _LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT.value, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON.value)
@@ -167,7 +161,7 @@ class Surfaces:
 
     def _reach(self, speed: Float[np.ndarray, " nv"]) -> tuple[float, float]:
         """Return how far contacts and limits travel in half a step at most."""
-        travel, least = (0.5 * self.timestep + 2 * self.lead) * speed, _LEAST_WIDTH * _USUAL_WIDTH
+        travel, least = (0.5 * self.timestep + 2 * self.lead) * speed, slope.LEAST_WIDTH * slope.USUAL_WIDTH
         return float(np.sort(self.levers @ travel)[-2:].sum()) + least, float(travel.sum() * self.longest) + least
 
     def beside(self, change: float, data: mujoco.MjData) -> tuple[Float[np.ndarray, " nv"] | None, bool]:
@@ -202,11 +196,11 @@ class Surfaces:
         widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
         if self.lead:
             # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
-            centres, widths = -self.lead * rate, _STAGES * widths
+            centres, widths = -self.lead * rate, slope.STAGES * widths
         fall = self.timestep**2 * np.abs(rows @ (self.kept * free))
         # A contact that rests crosses nothing, however near its surface it rests.
-        stirred = _STIRRED * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
-        widths = np.maximum(widths, np.minimum(least, np.maximum(np.minimum(fall, stirred), _SMALLEST)))
+        stirred = slope.STIRRED * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
+        widths = np.maximum(widths, np.minimum(least, np.maximum(np.minimum(fall, stirred), slope.SMALLEST)))
         is_rough &= gaps - centres < widths
         is_moved = self._moves(rows)
         is_undecided = jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)
@@ -236,7 +230,7 @@ class Surfaces:
 
     def _moves(self, rows: _Rows) -> _Mask:
         """Return which rows some coordinate moves."""
-        return np.linalg.norm(rows / self.lengths, axis=1) > 1 / _FARTHEST
+        return np.linalg.norm(rows / self.lengths, axis=1) > 1 / slope.FARTHEST
 
     def gaps(self, data: mujoco.MjData) -> tuple[bytes, _PerRow]:
         """Return what the rows of contacts and limits belong to, and their gaps, at the position in `data`."""
@@ -267,7 +261,7 @@ class Surfaces:
         for i, joint in zip(data.efc_id[limits].tolist(), is_joint.tolist(), strict=True):
             solimp.append((model.jnt_solimp if joint else model.tendon_solimp_lim)[i : i + 1])
         first_impedance, _, width, *_ = np.concatenate(solimp).T
-        width = np.where(width > 0, np.minimum(width, _USUAL_WIDTH), _USUAL_WIDTH)
+        width = np.where(width > 0, np.minimum(width, slope.USUAL_WIDTH), slope.USUAL_WIDTH)
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
         is_rough = np.zeros(len(rows), bool)
         is_rough[: len(first)] = self.is_rough[np.asarray(contact.geom).reshape(-1, 2)[acts]].any(axis=1)
@@ -275,8 +269,8 @@ class Surfaces:
             is_rough,
             rows,
             self._gaps_at(data, first, limits),
-            _LEAST_WIDTH * width,
-            first_impedance > _NO_JUMP,
+            slope.LEAST_WIDTH * width,
+            first_impedance > slope.NO_JUMP,
         )
 
 
@@ -353,7 +347,7 @@ def _by_modes(
         own = np.flatnonzero(group == one)
         left, sizes, _ = np.linalg.svd(scaled[index[own]], full_matrices=False)
         largest = np.abs(left).max(axis=0)
-        for weights in (largest * left).T[largest * sizes > 1 / _FARTHEST]:
+        for weights in (largest * left).T[largest * sizes > 1 / slope.FARTHEST]:
             patterns.append(np.zeros(len(index)))
             patterns[-1][own] = weights
             widest.append(widths[index[own]].max())
@@ -407,7 +401,7 @@ def _independent(rows: _Rows, others: Float[np.ndarray, "others nv"]) -> list[in
         size = np.linalg.norm(rest, axis=1)
         size[found] = 0.0
         best = int(np.argmax(size))
-        if size[best] < 1 / _FARTHEST:
+        if size[best] < 1 / slope.FARTHEST:
             break
         found.append(best)
         direction = rest[best] / size[best]

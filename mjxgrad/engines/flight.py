@@ -27,15 +27,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mjxgrad.engines.layout import Layout
+from mjxgrad.stepping import slope
 
-# Let go after one step that is alike, a rolling ball's derivatives scatter twice as far. Of a falling arm that bounces twice,
-# four keep both motions until the second bounce, which then is not averaged over its own phases.
-_NUM_ALIKE, _ALIKE = 3, 0.05
-_FAR = 10.0  # times the distance at first; a falling arm that bounces twice is off with 5
-_LONGEST = 100
-_BESIDE = 0.5  # of an event's window, up to which a pair may lie to one side of it; a falling arm is off without
 NUM_SLOTS = 96
-_STEPS = 10  # over which a difference of velocities is one of positions
 
 
 @dataclass
@@ -57,7 +51,7 @@ class Begun:
     widths: Float[np.ndarray, " modes"]
     apart: Float[np.ndarray, "modes size"]
     lost: Float[np.ndarray, "size modes"] | None = None
-    longest: int = _LONGEST
+    longest: int = slope.LONGEST
     by_others: dict[str, Float[np.ndarray, "modes entries"]] = field(default_factory=dict)
 
 
@@ -136,7 +130,7 @@ def fly(
         step: function from states and models to the states after a step.
         found: "felt", "slot", "apart" and "stays" with axes of motions and steps; "before" and "enters", without steps.
     """
-    scale = np.concatenate([lengths, _STEPS * timestep * lengths, np.zeros(layout.num_rest)])
+    scale = np.concatenate([lengths, slope.TRAVEL * timestep * lengths, np.zeros(layout.num_rest)])
     steps = course.rows.shape[1]
     by_step: dict[int, list[int]] = {}
     for motion, t in course.begun:
@@ -145,8 +139,8 @@ def fly(
         live, starting = flight.widths > 0, by_step.get(t, ())
         if live.any():
             size = np.linalg.norm(scale * flight.apart, axis=-1)
-            known = flight.alike >= _NUM_ALIKE
-            live &= (flight.left > 0) & ~(known & (size <= _FAR))
+            known = flight.alike >= slope.NUM_ALIKE
+            live &= (flight.left > 0) & ~(known & (size <= slope.FAR))
             for motion in starting:
                 near = known[motion] & live[motion]
                 if near.any():
@@ -207,10 +201,10 @@ def _advance(
             if one.lost is not None:
                 reach = np.abs(felt) * flight.widths[motions[own], slots[own]][:, None]
                 beside = np.linalg.norm(scale * (left - felt @ one.lost.T), axis=-1)
-                is_beside = (reach <= _BESIDE * one.widths).all(axis=1)
+                is_beside = (reach <= slope.BESIDE * one.widths).all(axis=1)
                 off[own] = np.where(is_beside, np.minimum(off[own], beside), off[own])
     is_sound = np.isfinite(apart).all(axis=-1) & course.is_finite[motions, t]
-    known = off <= _ALIKE * np.linalg.norm(scale * apart, axis=-1)
+    known = off <= slope.ALIKE * np.linalg.norm(scale * apart, axis=-1)
     flight.alike[motions, slots] = np.where(known, flight.alike[motions, slots] + 1, 0)
     flight.left[motions, slots] -= 1
     flight.ends[motions, slots] = np.where(is_sound[:, None, None], ends, 0.0)

@@ -21,6 +21,7 @@ from mjxgrad.engines.inverse import Inverse
 from mjxgrad.engines.layout import EVERY, INPUTS, Layout
 from mjxgrad.engines.stepmap import FIRST, PAIRS
 from mjxgrad.engines.steps import Stepper
+from mjxgrad.stepping import slope
 
 WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
@@ -266,7 +267,7 @@ class Worker:
         felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, layout.num_rest)))
         apart = layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]
         begun = Begun(felt, ends[..., layout.motion], 2 * widths, apart)
-        begun.longest = 2 if self.surfaces.lead else begun.longest
+        begun.longest = slope.LONGEST_OF_STAGES if self.surfaces.lead else slope.LONGEST
         return begun
 
     def _differentiate(self, one: _Row, names: list[str]) -> None:

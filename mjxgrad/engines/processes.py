@@ -59,11 +59,8 @@ class Processes:
 
     def __init__(self, count: int):
         root = Path(__file__).parents[1]
-        packages = {
-            "mjxgrad": str(root),
-            "mjxgrad.engines": str(root / "engines"),
-            "mjxgrad.scene": str(root / "scene"),
-        }
+        packages = {"mjxgrad": str(root)}
+        packages |= {f"mjxgrad.{name}": str(root / name) for name in ("engines", "scene", "stepping")}
         threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         places = os.pathsep.join(path for path in sys.path if path)
         start = functools.partial(

@@ -5,8 +5,8 @@ another step. Two motions that lie a step's travel apart tell what that does, un
 they differ. Here each motion has a few slots for such pairs, and everything has a fixed size, so that a GPU takes thousands of
 motions at a time.
 
-Of a pair, D is the difference of its two motions over how far apart they began, and h what its event has felt of a change. The
-change of a state is that along the motion, x, and of all pairs together:
+For each pair, D is the difference of its two motions over how far apart they began, and h what its event has felt of a change.
+The change of a state is that along the motion, x, and of all pairs together:
 
     whole = x + Σ D h,    x' = A (1 - P L) x + B u,    h' = h, or L x where a pair begins,    x += D h where one is let go.
 
@@ -14,8 +14,8 @@ h is carried as a zero that has a derivative, and D, P and L are constants to it
 the rule; the motions of pairs are stepped, not differentiated. Where nothing is differentiated, no pair begins.
 
 - A, along the motion, is one linear program, which also tells whether it explains a pair.
-- Of all contacts and limits near their surface the nearest count, as many as there are slots.
-- What a change of the model moves (a radius, a range) is in L, by the derivative of the gaps.
+- Contacts and limits near their surface count in the order of their distance, as many as there are slots.
+- A change of the model (a radius, a range) moves gaps, and L has the derivative of these.
 - A pair that lacks a slot takes that of the pair which is least apart.
 """
 
@@ -40,16 +40,14 @@ from mjxgrad.batched.sparse import sparsely
 from mjxgrad.bodies import tree
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import is_blind, slot_geoms
+from mjxgrad.stepping import slope
 from mjxgrad.stepping.contact import Discrete
 from mjxgrad.stepping.forward import advance, at_full_precision, smooth
 
 NUM_SLOTS = 4
-# These are as in `engines.events` and `engines.flight`.
-_LEAST_WIDTH, _USUAL_WIDTH, _SMALLEST, _STIRRED, _STAGES = 0.06, 1e-3, 1e-6, 4.0, 1.2
-_NO_JUMP, _FARTHEST = 0.01, 10.0
-_NUM_ALIKE, _ALIKE, _FAR, _LONGEST, _BESIDE, _STEPS = 3, 0.05, 10.0, 100, 0.5, 10
 _LEAST_LENGTH = 1e-3  # of a lever, over the extent of the model
 _COARSER = 10.0  # times, in single precision
+_MOST_HELD, _NUM_HOLDS = 8, 3  # rows, and how often those are sought that a displacement would carry across zero
 _LOOSE = 1e-3  # of the inverse inertia of rows that are held: they may depend on each other
 # Inputs that move nothing within a step.
 _FORCES = ("ctrl", "qfrc_applied", "xfrc_applied", "time", "qacc_warmstart")
@@ -59,7 +57,7 @@ _Change = Float[Array, " size"]
 
 
 class Motion(NamedTuple):
-    """What moves, of a state."""
+    """Positions, velocities and activations."""
 
     qpos: Float[Array, " nq"]
     qvel: Float[Array, " nv"]
@@ -139,7 +137,7 @@ def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, 
 class _Program:
     """The step and the rows of a model and its data, as functions of the leaves that only the running program knows.
 
-    What is known stays known, so that a step leaves out what a scene does not need. Functions are traced once for all uses.
+    Known leaves stay known, so that a step leaves out what a scene does not need. Functions are traced once for all uses.
     """
 
     def __init__(self, model: mjx.Model, data: mjx.Data):
@@ -252,7 +250,7 @@ class _Step:
         plan, reach = self._plan(events)
         ends, widths, apart = self._go_on(events, plan)
         is_alike = self._is_explained(events, plan, reach, apart, carried, (along, moved.qpos))
-        left = jnp.where(plan.begins, 2 if self.has_stages else _LONGEST, flight.left) - 1
+        left = jnp.where(plan.begins, slope.LONGEST_OF_STAGES if self.has_stages else slope.LONGEST, flight.left) - 1
         alike = jnp.where(plan.begins | ~is_alike, 0, flight.alike + 1)
         apart, plan, events = jax.tree.map(lambda x: checkpoint_name(x, SOLUTION), (apart, plan, events))
         # All that follows is linear in tangents.
@@ -288,7 +286,7 @@ class _Step:
     def _scaled(self, change: Float[Array, "slots size"]) -> Float[Array, " slots"]:
         """Return how large changes are (m)."""
         lengths = self.rows.lengths
-        by_speed = _STEPS * self.model.opt.timestep * lengths
+        by_speed = slope.TRAVEL * self.model.opt.timestep * lengths
         scale = jnp.concatenate([lengths, by_speed, jnp.zeros(self.size - 2 * self.nv, self.dtype)])
         return jnp.linalg.norm(scale * change, axis=1)
 
@@ -299,14 +297,14 @@ class _Step:
         speed = jnp.maximum(jnp.abs(rate), jnp.abs(rows @ after))
         centres, widths = jnp.zeros_like(gaps), 0.5 * h * speed
         if self.has_stages:
-            centres, widths = -0.5 * h * rate, _STAGES * widths
+            centres, widths = -0.5 * h * rate, slope.STAGES * widths
         kept = 1 / (1 + h * model.dof_damping * model.dof_invweight0)
         fall = h**2 * jnp.abs(rows @ (kept * every.acceleration))
-        width = jnp.where(solimp[:, 2] > 0, jnp.minimum(solimp[:, 2], _USUAL_WIDTH), _USUAL_WIDTH)
-        smallest = _SMALLEST * (1.0 if self.dtype == jnp.float64 else _COARSER)
-        least = jnp.maximum(jnp.minimum(fall, _STIRRED * h * speed), smallest)
-        widths = jnp.maximum(widths, jnp.minimum(_LEAST_WIDTH * width, least))
-        jumps = (solimp[:, 0] > _NO_JUMP) & (jnp.sum((rows / every.lengths) ** 2, axis=1) > 1 / _FARTHEST**2)
+        width = jnp.where(solimp[:, 2] > 0, jnp.minimum(solimp[:, 2], slope.USUAL_WIDTH), slope.USUAL_WIDTH)
+        smallest = slope.SMALLEST * (1.0 if self.dtype == jnp.float64 else _COARSER)
+        least = jnp.maximum(jnp.minimum(fall, slope.STIRRED * h * speed), smallest)
+        widths = jnp.maximum(widths, jnp.minimum(slope.LEAST_WIDTH * width, least))
+        jumps = (solimp[:, 0] > slope.NO_JUMP) & (jnp.sum((rows / every.lengths) ** 2, axis=1) > 1 / slope.FARTHEST**2)
         # Without a distance outside, the step after the crossing meets it.
         is_near = jnp.where(every.is_blind, (gaps < 0) & (gaps > -2 * widths), jnp.abs(gaps - centres) < widths)
         is_met = jnp.abs(gaps) < h * jnp.abs(rate)
@@ -328,26 +326,35 @@ class _Step:
         squares, left = jnp.linalg.eigh(jnp.where(same, own @ own.T, 0.0))
         largest = jnp.max(jnp.abs(left), axis=0)
         group = same[jnp.argmax(jnp.abs(left), axis=0)] & is_event  # of each mode
-        is_one = largest * jnp.sqrt(jnp.maximum(squares, 0.0)) > 1 / _FARTHEST
+        is_one = largest * jnp.sqrt(jnp.maximum(squares, 0.0)) > 1 / slope.FARTHEST
         weights = jnp.where(group & is_one[:, None], (largest * left).T, 0.0)
         widths = jnp.max(jnp.where(group, near.widths[index], 0.0), axis=1)
         to_middle = weights @ (near.centres - near.gaps)[index]
         to_middle = jnp.where((group[:, None] & group).any(axis=2), to_middle[:, None], 0.0)
         mode = weights @ own
 
-        def moving(along: Array) -> Float[Array, "nv modes"]:
-            return along.T @ jnp.linalg.inv(along @ mode.T + jnp.diag(jnp.where(is_one, 0.0, 1.0)))
+        is_free = ~jnp.zeros(len(far), bool).at[index].max(is_event)
 
-        moves = moving(mode)
-        reach = jnp.max(jnp.abs(scaled @ moves) * widths + jnp.abs(scaled @ (moves @ to_middle)), axis=1)
-        over = jnp.where(jnp.zeros(len(far), bool).at[index].max(is_event), -1.0, reach - jnp.abs(near.gaps))
-        over, index_held = jax.lax.top_k(over, count)
-        held = jnp.where((over > 0)[:, None], scaled[index_held], 0.0)
-        gram = held @ held.T
-        gram = gram + jnp.diag(jnp.where(over > 0, _LOOSE * jnp.diag(gram), 1.0))
-        rest = mode - (mode @ held.T) @ jnp.linalg.solve(gram, held)
-        can_hold = jnp.all(~is_one | (jnp.sum(rest**2, axis=1) > 1 / _FARTHEST**2))
-        moves = jnp.where(can_hold, moving(jnp.where(can_hold, rest, mode)), moves) / lengths[:, None]
+        def moving(is_held: Bool[Array, " all"]) -> Float[Array, "nv modes"]:
+            near_first, kept = jax.lax.top_k(
+                jnp.where(is_held, -jnp.abs(near.gaps), -jnp.inf), min(_MOST_HELD, len(far))
+            )
+            held = jnp.where(jnp.isfinite(near_first)[:, None], scaled[kept], 0.0)
+            gram = held @ held.T
+            gram = gram + jnp.diag(jnp.where(jnp.isfinite(near_first), _LOOSE * jnp.diag(gram), 1.0))
+            rest = mode - (mode @ held.T) @ jnp.linalg.solve(gram, held)
+            # A mode that hardly moves without them carries them along.
+            can_hold = jnp.all(~is_one | (jnp.sum(rest**2, axis=1) > 1 / slope.FARTHEST**2))
+            rest = jnp.where(can_hold, rest, mode)
+            return rest.T @ jnp.linalg.inv(rest @ mode.T + jnp.diag(jnp.where(is_one, 0.0, 1.0)))
+
+        def hold(_: Any, is_held: Bool[Array, " all"]) -> Bool[Array, " all"]:
+            moved = scaled @ moving(is_held)
+            reach = jnp.max(jnp.abs(moved) * widths + jnp.abs(moved @ to_middle), axis=1)
+            return is_held | (is_free & (jnp.abs(near.gaps) < reach))
+
+        is_held = jax.lax.fori_loop(0, _NUM_HOLDS, hold, jnp.zeros(len(far), bool))
+        moves = moving(is_held) / lengths[:, None]
         ahead = (weights * near.times[index]) @ near.rows[index]
         return _Events(is_one, mode * lengths, ahead, moves, moves @ to_middle, widths, weights, index)
 
@@ -359,8 +366,8 @@ class _Step:
         """Return who goes on and who begins, and how far apart at each event pairs are."""
         flight, is_one = self.flight, events.is_one
         far = self._scaled(flight.apart)
-        is_known = flight.alike >= _NUM_ALIKE
-        goes_on = (flight.widths > 0) & (flight.left > 0) & ~(is_known & (far <= _FAR))
+        is_known = flight.alike >= slope.NUM_ALIKE
+        goes_on = (flight.widths > 0) & (flight.left > 0) & ~(is_known & (far <= slope.FAR))
         reach = jnp.abs(self._felt(events) @ flight.apart.T) * flight.widths
         is_within = jnp.all(~is_one[:, None] | (reach <= 2 * events.widths[:, None]), axis=0) & jnp.any(is_one)
         goes_on &= ~(is_known & is_within)
@@ -404,9 +411,9 @@ class _Step:
         both = sparsely(jax.vmap(carried, (0, None)), plan.goes_on, jnp.stack([before, rest], axis=1), common)
         plain, expected = jnp.swapaxes(both, 0, 1)
         off = self._scaled(apart - expected - felt @ (plan.places.T @ apart))
-        is_beside = jnp.all(~events.is_one[:, None] | (reach <= 2 * _BESIDE * events.widths[:, None]), axis=0)
+        is_beside = jnp.all(~events.is_one[:, None] | (reach <= 2 * slope.BESIDE * events.widths[:, None]), axis=0)
         off = jnp.where(is_beside, jnp.minimum(off, self._scaled(apart - plain)), off)
-        return off <= _ALIKE * self._scaled(apart)
+        return off <= slope.ALIKE * self._scaled(apart)
 
 
 class _Rows(eqx.Module):
@@ -415,9 +422,9 @@ class _Rows(eqx.Module):
     Attributes:
         rows: J of their normals.
         gaps: distances less margins (m or rad).
-        solimp: of each.
+        solimp: their impedances.
         is_blind: whose distance is known only where they overlap.
-        acceleration: of free motion.
+        acceleration: free motion, without contact.
         lengths: how far each velocity moves the farthest point below it (m or 1).
         is_contact: which are contacts, by themselves.
     """
