@@ -38,9 +38,9 @@ from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.batched.maps import safe_norm
 from mjxgrad.batched.sparse import sparsely
 from mjxgrad.bodies import tree
-from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.bodies.kinematics import integrate_position, kinematics, position_change
 from mjxgrad.contact.collision import is_blind, slot_geoms
-from mjxgrad.stepping import slope
+from mjxgrad.stepping import assembly, slope
 from mjxgrad.stepping.contact import Discrete
 from mjxgrad.stepping.forward import advance, at_full_precision, smooth
 
@@ -74,6 +74,7 @@ class Flight(eqx.Module):
         alike: for how many steps the derivative along the motion has explained them.
         apart: D, in tangent space.
         held: h; zeros whose derivative it is.
+        lengths: how far each velocity moves the farthest point below it, at the reference pose (m or 1).
     """
 
     ends: Motion
@@ -82,6 +83,7 @@ class Flight(eqx.Module):
     alike: Int[Array, " slots"]
     apart: Float[Array, "slots size"]
     held: Float[Array, " slots"]
+    lengths: Float[Array, " nv"]
 
 
 def no_flight(model: mjx.Model, data: mjx.Data) -> Flight:
@@ -89,7 +91,8 @@ def no_flight(model: mjx.Model, data: mjx.Data) -> Flight:
     count, size, dtype = NUM_SLOTS, 2 * model.nv + model.na, data.qvel.dtype
     ends = Motion(*(jnp.zeros((count, 2, n), dtype) for n in (model.nq, model.nv, model.na)))
     none, steps = jnp.zeros(count, dtype), jnp.zeros(count, jnp.int32)
-    return Flight(ends, none, steps, steps, jnp.zeros((count, size), dtype), none)
+    lengths = jax.lax.stop_gradient(_lengths(model, data))
+    return Flight(ends, none, steps, steps, jnp.zeros((count, size), dtype), none, lengths)
 
 
 def whole(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
@@ -150,7 +153,7 @@ class _Program:
         self.places = tuple(self.unknown.index(i) for i in moving)
         self.moves_gaps = [i not in moving and i not in forces for i in self.unknown]
         self.step = jax.jit(lambda *given: advance(*self.all_of(given), Discrete()))
-        self.rows = jax.jit(lambda *given: _rows(*self.all_of(given)))
+        self.rows = jax.jit(lambda *given: rows_of(*_smoothed(*self.all_of(given))))
 
     def all_of(self, given: Sequence[Any]) -> tuple[mjx.Model, mjx.Data]:
         """Return model and data with these leaves."""
@@ -239,13 +242,13 @@ class _Step:
 
         change = self._tangent(self.now.qpos, program.motion(tangents))
         heard = _dense(given_flight.held, flight.held)
-        rows = program.rows(*self.given)
+        # A step's data belongs to its state; that of several stages to the last of them.
+        rows = program.rows(*self.given) if self.has_stages else rows_of(self.model, put(moved, self.now))
         if rows is None:
             return self._done(moved, flight, along(change, *rates), heard)
-        self.rows = rows
         near = self._near(rows, moved.qvel)
         modes = lambda near, lengths: self._by_modes(near, rows.is_contact, lengths)  # noqa: E731
-        events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), rows.lengths)
+        events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), self.flight.lengths)
         events = jax.tree.map(lambda x: x[0], events)
         plan, reach = self._plan(events)
         ends, widths, apart = self._go_on(events, plan)
@@ -268,7 +271,7 @@ class _Step:
             feels = feels + events.weights @ by_others[events.chosen]
         change = change.at[: self.nv].add(-events.moves @ feels)
         heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels
-        after = Flight(ends, widths, left, alike, apart, flight.held)
+        after = Flight(ends, widths, left, alike, apart, flight.held, flight.lengths)
         return self._done(moved, after, along(change, *rates), heard)
 
     def _done(self, moved: mjx.Data, flight: Flight, rates: mjx.Data, heard: Array) -> tuple[Any, Any]:
@@ -285,7 +288,7 @@ class _Step:
 
     def _scaled(self, change: Float[Array, "slots size"]) -> Float[Array, " slots"]:
         """Return how large changes are (m)."""
-        lengths = self.rows.lengths
+        lengths = self.flight.lengths
         by_speed = slope.TRAVEL * self.model.opt.timestep * lengths
         scale = jnp.concatenate([lengths, by_speed, jnp.zeros(self.size - 2 * self.nv, self.dtype)])
         return jnp.linalg.norm(scale * change, axis=1)
@@ -304,7 +307,9 @@ class _Step:
         smallest = slope.SMALLEST * (1.0 if self.dtype == jnp.float64 else _COARSER)
         least = jnp.maximum(jnp.minimum(fall, slope.STIRRED * h * speed), smallest)
         widths = jnp.maximum(widths, jnp.minimum(slope.LEAST_WIDTH * width, least))
-        jumps = (solimp[:, 0] > slope.NO_JUMP) & (jnp.sum((rows / every.lengths) ** 2, axis=1) > 1 / slope.FARTHEST**2)
+        jumps = (solimp[:, 0] > slope.NO_JUMP) & (
+            jnp.sum((rows / self.flight.lengths) ** 2, axis=1) > 1 / slope.FARTHEST**2
+        )
         # Without a distance outside, the step after the crossing meets it.
         is_near = jnp.where(every.is_blind, (gaps < 0) & (gaps > -2 * widths), jnp.abs(gaps - centres) < widths)
         is_met = jnp.abs(gaps) < h * jnp.abs(rate)
@@ -425,7 +430,6 @@ class _Rows(eqx.Module):
         solimp: their impedances.
         is_blind: whose distance is known only where they overlap.
         acceleration: free motion, without contact.
-        lengths: how far each velocity moves the farthest point below it (m or 1).
         is_contact: which are contacts, by themselves.
     """
 
@@ -434,13 +438,16 @@ class _Rows(eqx.Module):
     solimp: Float[Array, "all 5"]
     is_blind: Bool[Array, " all"]
     acceleration: _Vector
-    lengths: _Vector
     is_contact: tuple[bool, ...] = eqx.field(static=True)
 
 
-def _rows(model: mjx.Model, data: mjx.Data) -> _Rows | None:
-    """Return all contacts and limits of a state; None if the scene has none."""
-    data, blocks = smooth(model, data)
+def _smoothed(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
+    return model, smooth(model, data)[0]
+
+
+def rows_of(model: mjx.Model, data: mjx.Data) -> _Rows | None:
+    """Return all contacts and limits of data whose fields are those of its state; None if the scene has none."""
+    blocks = assembly.gather(model, data)
     blocks = [block for block in blocks if block.rows_each]
     if not blocks:
         return None
@@ -457,12 +464,12 @@ def _rows(model: mjx.Model, data: mjx.Data) -> _Rows | None:
     kinds = tuple(
         block.slots is not None for block, (own, _) in zip(blocks, firsts, strict=True) for _ in range(len(own))
     )
-    return _Rows(
-        jnp.concatenate(rows), gaps, solimp, jnp.concatenate(blind), data.qacc_smooth, _lengths(model, data), kinds
-    )
+    return _Rows(jnp.concatenate(rows), gaps, solimp, jnp.concatenate(blind), data.qacc_smooth, kinds)
 
 
 def _lengths(model: mjx.Model, data: mjx.Data) -> _Vector:
+    dtype = data.qvel.dtype
+    data = kinematics(model, data.replace(qpos=jnp.asarray(model.qpos0, dtype)))
     joints = model.dof_jntid
     is_below = tree.moving_dofs(model)[model.geom_bodyid].astype(bool)
     size = jnp.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, 0.0, model.geom_rbound)
@@ -471,7 +478,7 @@ def _lengths(model: mjx.Model, data: mjx.Data) -> _Vector:
     kinds, places = model.jnt_type[joints], np.arange(model.nv) - model.jnt_dofadr[joints]
     is_straight = kinds == mujoco.mjtJoint.mjJNT_SLIDE
     is_straight |= (kinds == mujoco.mjtJoint.mjJNT_FREE) & (places < 3)
-    return jnp.where(is_straight, 1.0, lever).astype(data.qvel.dtype)
+    return jnp.where(is_straight, 1.0, lever).astype(dtype)
 
 
 def _with_change(model: mjx.Model, motion: Motion, change: _Change) -> Motion:
