@@ -129,7 +129,7 @@ def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, 
 
     def differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
         with at_full_precision(model, data):
-            found, rates = _Step(program, primals[0], list(primals[1:])).differentiate(tangents[0], tangents[1:])
+            found, rates = _Step(program, primals[0], primals[1:]).differentiate(tangents[0], tangents[1:])
         return tuple(_as_batched(program.motion(primals[1:]).qpos, x) for x in (found, rates))
 
     run.defjvp(differentiated, symbolic_zeros=True)
@@ -157,20 +157,14 @@ class _Program:
 
     def all_of(self, given: Sequence[Any]) -> tuple[mjx.Model, mjx.Data]:
         """Return model and data with these leaves."""
-        every = list(self.leaves)
-        for i, value in zip(self.unknown, given, strict=True):
-            every[i] = value
-        return jax.tree.unflatten(self.form, every)
+        return jax.tree.unflatten(self.form, _with(self.leaves, self.unknown, given))
 
     def motion(self, given: Sequence[Any]) -> Motion:
         return Motion(*(given[k] for k in self.places))
 
     def put(self, given: Sequence[Any], motion: Motion) -> list[Any]:
         """Return leaves with another motion."""
-        changed = list(given)
-        for k, value in zip(self.places, motion, strict=True):
-            changed[k] = value
-        return changed
+        return _with(given, self.places, motion)
 
 
 class _Near(NamedTuple):
@@ -206,11 +200,12 @@ class _Plan(NamedTuple):
 
 
 class _Step:
-    """One step of a motion and of its pairs."""
+    """One step of a motion and of its pairs. All but the derivative along the motion is a constant to further derivatives."""
 
-    def __init__(self, program: _Program, flight: Flight, given: list[Array]):
-        self.program, self.flight, self.given = program, flight, given
-        self.model, self.now = program.all_of(given)[0], program.motion(given)
+    def __init__(self, program: _Program, flight: Flight, given: Sequence[Array]):
+        self.program, self.given = program, list(given)
+        self.flight, self.still = jax.lax.stop_gradient((flight, self.given))
+        self.model, self.now = program.all_of(self.still)[0], program.motion(self.still)
         self.nv, self.size, self.dtype = self.model.nv, flight.apart.shape[1], self.now.qvel.dtype
         self.has_stages = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
@@ -220,64 +215,67 @@ class _Step:
         # Leaves, beside the motion, that have a tangent.
         others = [k for k, x in enumerate(tangents) if k not in program.places and not isinstance(x, SymbolicZero)]
         values, rates = [self.given[k] for k in others], [tangents[k] for k in others]
-
-        def with_values(values: Sequence[Array]) -> list[Array]:
-            changed = list(self.given)
-            for k, value in zip(others, values, strict=True):
-                changed[k] = value
-            return changed
+        now = program.motion(self.given)
 
         def moved_by(change: _Change, *values: Array) -> tuple[mjx.Data, mjx.Data]:
-            motion = _with_change(self.model, self.now, change)
-            found, rest = eqx.partition(program.step(*program.put(with_values(values), motion)), eqx.is_inexact_array)
-            return found, rest
+            given = program.put(
+                _with(self.given, others, values), _with_change(program.all_of(self.given)[0], now, change)
+            )
+            return eqx.partition(program.step(*given), eqx.is_inexact_array)
 
         found, along, rest = jax.linearize(moved_by, jnp.zeros(self.size, self.dtype), *values, has_aux=True)
         moved = eqx.combine(found, rest)
-
-        def carried(change: _Change, common: tuple[Any, Array]) -> _Change:
-            """Return A times a change."""
-            along, qpos = common
-            return self._tangent(qpos, taken(along(change, *map(jnp.zeros_like, values))))
-
-        change = self._tangent(self.now.qpos, program.motion(tangents))
+        change = self._tangent(now.qpos, program.motion(tangents))
         heard = _dense(given_flight.held, flight.held)
         # A step's data belongs to its state; that of several stages to the last of them.
-        rows = program.rows(*self.given) if self.has_stages else rows_of(self.model, put(moved, self.now))
-        if rows is None:
-            return self._done(moved, flight, along(change, *rates), heard)
+        ends = jax.lax.stop_gradient(moved)
+        rows = program.rows(*self.still) if self.has_stages else rows_of(self.model, put(ends, self.now))
+        after = flight
+        if rows is not None:
+
+            def carried(change: _Change, common: tuple[Any, Array]) -> _Change:
+                """Return A times a change."""
+                along, qpos = common
+                return self._tangent(qpos, taken(along(change, *map(jnp.zeros_like, values))))
+
+            common = (jax.lax.stop_gradient(along), ends.qpos)
+            events, plan, after = self._followed(
+                rows, ends, lambda changes, wanted: sparsely(jax.vmap(carried, (0, None)), wanted, changes, common)
+            )
+            # All that follows is linear in tangents.
+            change = change + flight.apart.T @ jnp.where(plan.goes_on, 0.0, heard)
+            feels = events.rows @ change[: self.nv] + events.ahead @ change[self.nv : 2 * self.nv]
+            if moving := [k for k in others if program.moves_gaps[k]]:
+                feels = feels + events.weights @ self._gap_rates(moving, tangents)[events.chosen]
+            change = change.at[: self.nv].add(-events.moves @ feels)
+            heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels
+        still = jax.tree.map(_no_tangent, (moved, after))
+        rates = eqx.combine(along(change, *rates), still[0])
+        return (moved, after), (rates, eqx.tree_at(lambda x: x.held, still[1], heard))
+
+    def _gap_rates(self, moving: list[int], tangents: Sequence[Any]) -> Float[Array, " all"]:
+        """Return the tangent of all gaps by leaves beside the motion."""
+
+        def gaps(*values: Array) -> Float[Array, " all"]:
+            return self.program.rows(*_with(self.given, moving, values)).gaps
+
+        return jax.jvp(gaps, [self.given[k] for k in moving], [tangents[k] for k in moving])[1]
+
+    def _followed(self, rows: "_Rows", moved: mjx.Data, carried: Any) -> tuple[_Events, _Plan, Flight]:
+        """Return the events of the step, who goes on and who begins, and the flight after the step."""
+        flight = self.flight
         near = self._near(rows, moved.qvel)
         modes = lambda near, lengths: self._by_modes(near, rows.is_contact, lengths)  # noqa: E731
-        events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), self.flight.lengths)
+        events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), flight.lengths)
         events = jax.tree.map(lambda x: x[0], events)
         plan, reach = self._plan(events)
         ends, widths, apart = self._go_on(events, plan)
-        is_alike = self._is_explained(events, plan, reach, apart, carried, (along, moved.qpos))
-        left = jnp.where(plan.begins, slope.LONGEST_OF_STAGES if self.has_stages else slope.LONGEST, flight.left) - 1
+        is_alike = self._is_explained(events, plan, reach, apart, carried)
+        longest = slope.LONGEST_OF_STAGES if self.has_stages else slope.LONGEST
+        left = jnp.where(plan.begins, longest, flight.left) - 1
         alike = jnp.where(plan.begins | ~is_alike, 0, flight.alike + 1)
         apart, plan, events = jax.tree.map(lambda x: checkpoint_name(x, SOLUTION), (apart, plan, events))
-        # All that follows is linear in tangents.
-        change = change + flight.apart.T @ jnp.where(plan.goes_on, 0.0, heard)
-        feels = events.rows @ change[: self.nv] + events.ahead @ change[self.nv : 2 * self.nv]
-        if moving := [k for k in others if program.moves_gaps[k]]:
-
-            def gaps(*values: Array) -> Float[Array, " all"]:
-                changed = list(self.given)
-                for k, value in zip(moving, values, strict=True):
-                    changed[k] = value
-                return program.rows(*changed).gaps
-
-            by_others = jax.jvp(gaps, [self.given[k] for k in moving], [tangents[k] for k in moving])[1]
-            feels = feels + events.weights @ by_others[events.chosen]
-        change = change.at[: self.nv].add(-events.moves @ feels)
-        heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels
-        after = Flight(ends, widths, left, alike, apart, flight.held, flight.lengths)
-        return self._done(moved, after, along(change, *rates), heard)
-
-    def _done(self, moved: mjx.Data, flight: Flight, rates: mjx.Data, heard: Array) -> tuple[Any, Any]:
-        still = jax.tree.map(_no_tangent, (moved, flight))
-        rates = eqx.combine(rates, still[0])
-        return (moved, flight), (rates, eqx.tree_at(lambda x: x.held, still[1], heard))
+        return events, plan, Flight(ends, widths, left, alike, apart, flight.held, flight.lengths)
 
     def _tangent(self, qpos: Array, rates: Motion) -> _Change:
         """Return the tangent of a motion in tangent space."""
@@ -397,7 +395,7 @@ class _Step:
         def step(starts: Motion, given: list[Array]) -> Motion:
             return jax.vmap(lambda motion: taken(self.program.step(*self.program.put(given, motion))))(starts)
 
-        ends = sparsely(step, plan.goes_on | plan.begins, starts, self.given)
+        ends = sparsely(step, plan.goes_on | plan.begins, starts, self.still)
         widths = jnp.where(plan.goes_on, flight.widths, plan.places @ (2 * events.widths))
         one, other = (jax.tree.map(lambda x, side=side: x[:, side], ends) for side in (0, 1))
         by_position = jax.vmap(lambda x, y: position_change(model, y, x))(one.qpos, other.qpos)
@@ -407,14 +405,13 @@ class _Step:
         return ends, jnp.where(is_sound, widths, 0.0), apart
 
     def _is_explained(
-        self, events: _Events, plan: _Plan, reach: Array, apart: Float[Array, "slots size"], carried: Any, common: Any
+        self, events: _Events, plan: _Plan, reach: Array, apart: Float[Array, "slots size"], carried: Any
     ) -> Bool[Array, " slots"]:
         """Return whether the derivative along the motion says how pairs differ, but for events that lie between the two."""
         before = self.flight.apart
         felt = before @ self._felt(events).T  # slots modes
         rest = before.at[:, : self.nv].add(-felt @ events.moves.T)
-        both = sparsely(jax.vmap(carried, (0, None)), plan.goes_on, jnp.stack([before, rest], axis=1), common)
-        plain, expected = jnp.swapaxes(both, 0, 1)
+        plain, expected = jnp.swapaxes(carried(jnp.stack([before, rest], axis=1), plan.goes_on), 0, 1)
         off = self._scaled(apart - expected - felt @ (plan.places.T @ apart))
         is_beside = jnp.all(~events.is_one[:, None] | (reach <= 2 * slope.BESIDE * events.widths[:, None]), axis=0)
         off = jnp.where(is_beside, jnp.minimum(off, self._scaled(apart - plain)), off)
@@ -498,6 +495,14 @@ def _as_batched(qpos: Array, found: Any) -> Any:
         return jnp.where(is_any, x, x) if x.size else jnp.zeros(x.shape, x.dtype)
 
     return jax.tree.map(batched, found)
+
+
+def _with(given: Sequence[Any], places: Sequence[int], values: Sequence[Any]) -> list[Any]:
+    """Return a list with other values in some places."""
+    changed = list(given)
+    for k, value in zip(places, values, strict=True):
+        changed[k] = value
+    return changed
 
 
 def _dense(tangent: Any, value: Array) -> Array:
