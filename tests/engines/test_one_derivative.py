@@ -133,6 +133,22 @@ def test_mjx_has_the_derivative_of_c_mujoco(by_array, route):
     assert (off < 1e-3).all()
 
 
+@pytest.mark.slow
+def test_both_engines_have_one_derivative_in_single_precision():
+    with jax.enable_x64(False):
+        found = []
+        for engine in ("mujoco", "mjx"):
+            scene, heights = mg.load_scene(LINKS).with_engine(engine), jnp.asarray(np.asarray(HEIGHTS), jnp.float32)
+
+            def course(height, scene=scene):
+                moved = mg.rollout(scene, _start(scene, height), jnp.zeros((HORIZON, 1)), contact=mg.Slope())
+                return jnp.concatenate([moved.qpos, moved.qvel], axis=1)[SKIP::SKIP]
+
+            found.append(np.asarray(jax.jit(jax.vmap(jax.jacfwd(course)))(heights)))
+        assert found[1].dtype == np.float32
+        np.testing.assert_allclose(found[1], found[0], atol=1e-3 * np.abs(found[0]).max())
+
+
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_reverse_mode_through_a_policy_is_forward_mode(scene, engine):
     """By a gain, which moves the landings."""

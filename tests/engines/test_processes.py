@@ -7,7 +7,7 @@ import pytest
 from mjxgrad.engines import pool as pools
 from mjxgrad.engines.jacobians import with_pairs
 from mjxgrad.engines.pool import Pool
-from mjxgrad.engines.processes import Processes, are_possible, processes
+from mjxgrad.engines.processes import Processes, are_possible
 from tests.processes import run_python
 
 BALL = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
@@ -91,4 +91,3 @@ def test_a_process_imports_no_jax():
         "own = p.Processes(1); print(own.children[0].stdout.read())",
     )
     assert "False" in said
-    assert processes.cache_info().maxsize is None
