@@ -97,12 +97,17 @@ def no_flight(model: mjx.Model, data: mjx.Data) -> Flight:
 
 def whole(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
     """Return a motion with the derivative of all that is in flight beside it."""
-    return _with_change(model, motion, jax.lax.stop_gradient(flight.apart).T @ flight.held)
+    return _with_change(model, motion, _in_flight(flight))
 
 
 def without(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
     """Return a motion without the derivative of what is in flight beside it; the inverse of `whole`."""
-    return _with_change(model, motion, -jax.lax.stop_gradient(flight.apart).T @ flight.held)
+    return _with_change(model, motion, -_in_flight(flight))
+
+
+def _in_flight(flight: Flight) -> _Change:
+    # NVIDIA GPUs would round the factors to ten bits, as in all products of a step.
+    return jnp.matmul(jax.lax.stop_gradient(flight.apart).T, flight.held, precision="highest")
 
 
 def taken(data: mjx.Data) -> Motion:
@@ -133,7 +138,8 @@ def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, 
         return tuple(_as_batched(program.motion(primals[1:]).qpos, x) for x in (found, rates))
 
     run.defjvp(differentiated, symbolic_zeros=True)
-    moved, after = run(flight, *program.given)
+    with at_full_precision(model, data):
+        moved, after = run(flight, *program.given)
     return moved, eqx.tree_at(lambda x: x.held, jax.lax.stop_gradient(after), after.held)
 
 

@@ -43,3 +43,14 @@ def test_the_mean_derivative_of_a_bounce_is_its_slope_and_the_motion_is_mujocos(
     found = compare_to_slope(PLACES, outcomes, [derivatives, discrete], ("slope", "discrete"))
     np.testing.assert_allclose(found.mean[0], found.slope, atol=0.02)
     assert abs(found.mean[1] - found.slope) > 0.5  # a tooth's
+
+
+@pytest.mark.parametrize("transform", [lambda f: f, jax.grad], ids=["motion", "gradient"])
+def test_no_product_is_left_to_a_gpus_ten_bits(transform):
+    scene = mg.load_scene(BALL.format(limit="", contact=""))
+
+    def end(speed):
+        return mg.rollout(scene, mg.initial_state(scene, qvel=speed), horizon=3, contact=mg.Slope()).qpos[-1, 0]
+
+    program = str(jax.make_jaxpr(transform(end))(jnp.ones(1)))
+    assert program.count("dot_general[") == program.count("Precision.HIGHEST, Precision.HIGHEST") > 0
