@@ -8,6 +8,7 @@ A policy learns for a while and is frozen. Each kind of gradient then names a di
   motion with the same noise on both sides, per unit of root-mean-square change of the actions.
 """
 
+import dataclasses
 import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -139,6 +140,7 @@ class _Frozen:
             task, learner, settings = self.task.with_contact(contact), self.learner, self.settings
 
             def one(state, noise: Array) -> tuple[Window, Gradients]:
+                state = dataclasses.replace(state, physics=task.completed(state.physics))
                 networks = (self.actor_of(self.params), learner.target, learner.normaliser)
                 window, _, gradients = window_gradients(
                     task, state, learner.key, noise, *networks, self.stddev, settings.discount, trace

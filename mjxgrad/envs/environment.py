@@ -148,7 +148,7 @@ class Environment(InScene):
         one_key(key)
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
-        physics = engine_of(self.scene, self.contact).complete(self.scene, physics, self.contact)
+        physics = self.completed(physics)
         obs = self.observe(physics, memory)
         action = jnp.zeros(self.num_actions, obs.dtype)
         terms = jax.eval_shape(lambda: self.rewards(physics, action, physics, memory))
@@ -157,6 +157,10 @@ class Environment(InScene):
         metrics = dict.fromkeys([*terms, "diverged"], zero)
         counter, hidden = jnp.zeros((), jnp.int32), self.privileged(physics, memory)
         return EnvState(physics, obs, hidden, zero, no, no, metrics, counter, memory, next_key)
+
+    def completed(self, physics: State) -> State:
+        """Return a state with all that this environment's contact carries, such as the pairs of motions of a slope."""
+        return engine_of(self.scene, self.contact).complete(self.scene, physics, self.contact)
 
     def step(self, state: EnvState, action: Float[Array, " nu"]) -> EnvState:
         """Apply an action for `frame_skip` time steps; an episode that ended is not reset, see `step_on`.
@@ -201,6 +205,9 @@ class Environment(InScene):
         stepped = self.step(state, action)
         key, fresh_key = jax.random.split(stepped.key)
         fresh = jax.lax.stop_gradient(self.reset(fresh_key))
+        # A state from another environment may have other pairs, or none.
+        if jax.tree.structure(fresh) != jax.tree.structure(stepped):
+            fresh = eqx.tree_at(_pairs, fresh, _pairs(stepped), is_leaf=lambda x: x is None)
         following = jax.tree.map(lambda new, old: jnp.where(stepped.done, new, old), fresh, stepped)
         return stepped, dataclasses.replace(following, key=key)
 
@@ -226,3 +233,7 @@ class Environment(InScene):
         """Return the key of one copy, for `randomised`, and the start of its first episode."""
         copy_key, reset_key = jax.random.split(key)
         return copy_key, self.randomised(copy_key).reset(reset_key)
+
+
+def _pairs(state: EnvState) -> PyTree:
+    return state.physics.pairs
