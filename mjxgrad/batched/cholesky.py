@@ -69,8 +69,11 @@ def _solve_jvp(primals, tangents):
     )
 
 
-def written_out(matrix: _Matrix, vector: _Vector) -> _Vector:
-    """Return matrix⁻¹ vector by columns; the vector is factored along as one more row."""
+def written_out(matrix: Float[Array, "n n *fewer"], vector: _Vector) -> _Vector:
+    """Return matrix⁻¹ vector by columns; the vector is factored along as one more row.
+
+    Vectors may share a matrix, whose axis then has length one.
+    """
     columns: list[Array] = []  # columns of the factor, from the diagonal down
     forward: list[Array] = []
     for k in range(len(vector)):

@@ -13,7 +13,7 @@ The change of a state is that along the motion, x, and of all pairs together:
 h is carried as a zero that has a derivative, and D, P and L are constants to it. So forward and reverse mode of this program are
 the rule; the motions of pairs are stepped, not differentiated. Where nothing is differentiated, no pair begins.
 
-- A, along the motion, is one linear program, which also tells whether it explains a pair.
+- A, along the motion, is one linear program; small differences of steps tell whether it explains a pair.
 - Contacts and limits near their surface count in the order of their distance, as many as there are slots.
 - A change of the model (a radius, a range) moves gaps, and L has the derivative of these.
 - A pair that lacks a slot takes that of the pair which is least apart.
@@ -34,6 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._arrays import with_derivative_of
 from mjxgrad._mjx import mjx
+from mjxgrad.batched import cholesky, symmetric
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.batched.maps import safe_norm
 from mjxgrad.batched.sparse import sparsely
@@ -49,6 +50,8 @@ _LEAST_LENGTH = 1e-3  # of a lever, over the extent of the model
 _COARSER = 10.0  # times, in single precision
 _MOST_HELD, _NUM_HOLDS = 8, 3  # rows, and how often those are sought that a displacement would carry across zero
 _LOOSE = 1e-3  # of the inverse inertia of rows that are held: they may depend on each other
+# Small differences: of the farthest points (m, m/s). In single precision rounding is 0.4 % of them.
+_SMALL, _SMALL_IN_SINGLE = (1e-7, 1e-5), (3e-5, 1e-3)
 # Inputs that move nothing within a step.
 _FORCES = ("ctrl", "qfrc_applied", "xfrc_applied", "time", "qacc_warmstart")
 
@@ -238,16 +241,7 @@ class _Step:
         rows = program.rows(*self.still) if self.has_stages else rows_of(self.model, put(ends, self.now))
         after = flight
         if rows is not None:
-
-            def carried(change: _Change, common: tuple[Any, Array]) -> _Change:
-                """Return A times a change."""
-                along, qpos = common
-                return self._tangent(qpos, taken(along(change, *map(jnp.zeros_like, values))))
-
-            common = (jax.lax.stop_gradient(along), ends.qpos)
-            events, plan, after = self._followed(
-                rows, ends, lambda changes, wanted: sparsely(jax.vmap(carried, (0, None)), wanted, changes, common)
-            )
+            events, plan, after = self._followed(rows, ends)
             # All that follows is linear in tangents.
             change = change + flight.apart.T @ jnp.where(plan.goes_on, 0.0, heard)
             feels = events.rows @ change[: self.nv] + events.ahead @ change[self.nv : 2 * self.nv]
@@ -267,7 +261,7 @@ class _Step:
 
         return jax.jvp(gaps, [self.given[k] for k in moving], [tangents[k] for k in moving])[1]
 
-    def _followed(self, rows: "_Rows", moved: mjx.Data, carried: Any) -> tuple[_Events, _Plan, Flight]:
+    def _followed(self, rows: "_Rows", moved: mjx.Data) -> tuple[_Events, _Plan, Flight]:
         """Return the events of the step, who goes on and who begins, and the flight after the step."""
         flight = self.flight
         near = self._near(rows, moved.qvel)
@@ -275,8 +269,10 @@ class _Step:
         events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), flight.lengths)
         events = jax.tree.map(lambda x: x[0], events)
         plan, reach = self._plan(events)
-        ends, widths, apart = self._go_on(events, plan)
-        is_alike = self._is_explained(events, plan, reach, apart, carried)
+        felt = flight.apart @ self._felt(events).T  # slots modes
+        rest = flight.apart.at[:, : self.nv].add(-felt @ events.moves.T)
+        ends, widths, apart, expected = self._go_on(events, plan, jnp.stack([flight.apart, rest], axis=1), taken(moved))
+        is_alike = self._is_explained(events, plan, reach, apart, felt, expected)
         longest = slope.LONGEST_OF_STAGES if self.has_stages else slope.LONGEST
         left = jnp.where(plan.begins, longest, flight.left) - 1
         alike = jnp.where(plan.begins | ~is_alike, 0, flight.alike + 1)
@@ -332,7 +328,7 @@ class _Step:
         same = (shares[:, None] & shares).any(axis=2) | np.eye(count, dtype=bool)
         for _ in range(math.ceil(math.log2(count))):
             same = (same[:, :, None] & same).any(axis=1)
-        squares, left = jnp.linalg.eigh(jnp.where(same, own @ own.T, 0.0))
+        squares, left = symmetric.eigh(jnp.where(same, own @ own.T, 0.0))
         largest = jnp.max(jnp.abs(left), axis=0)
         group = same[jnp.argmax(jnp.abs(left), axis=0)] & is_event  # of each mode
         is_one = largest * jnp.sqrt(jnp.maximum(squares, 0.0)) > 1 / slope.FARTHEST
@@ -341,31 +337,54 @@ class _Step:
         to_middle = weights @ (near.centres - near.gaps)[index]
         to_middle = jnp.where((group[:, None] & group).any(axis=2), to_middle[:, None], 0.0)
         mode = weights @ own
-
         is_free = ~jnp.zeros(len(far), bool).at[index].max(is_event)
-
-        def moving(is_held: Bool[Array, " all"]) -> Float[Array, "nv modes"]:
-            near_first, kept = jax.lax.top_k(
-                jnp.where(is_held, -jnp.abs(near.gaps), -jnp.inf), min(_MOST_HELD, len(far))
-            )
-            held = jnp.where(jnp.isfinite(near_first)[:, None], scaled[kept], 0.0)
-            gram = held @ held.T
-            gram = gram + jnp.diag(jnp.where(jnp.isfinite(near_first), _LOOSE * jnp.diag(gram), 1.0))
-            rest = mode - (mode @ held.T) @ jnp.linalg.solve(gram, held)
-            # A mode that hardly moves without them carries them along.
-            can_hold = jnp.all(~is_one | (jnp.sum(rest**2, axis=1) > 1 / slope.FARTHEST**2))
-            rest = jnp.where(can_hold, rest, mode)
-            return rest.T @ jnp.linalg.inv(rest @ mode.T + jnp.diag(jnp.where(is_one, 0.0, 1.0)))
-
-        def hold(_: Any, is_held: Bool[Array, " all"]) -> Bool[Array, " all"]:
-            moved = scaled @ moving(is_held)
-            reach = jnp.max(jnp.abs(moved) * widths + jnp.abs(moved @ to_middle), axis=1)
-            return is_held | (is_free & (jnp.abs(near.gaps) < reach))
-
-        is_held = jax.lax.fori_loop(0, _NUM_HOLDS, hold, jnp.zeros(len(far), bool))
-        moves = moving(is_held) / lengths[:, None]
+        moves = self._moving(mode, is_one, scaled, jnp.where(is_free, jnp.abs(near.gaps), jnp.inf), widths, to_middle)
+        is_one &= jnp.sum(moves**2, axis=0) < slope.FARTHEST**4  # modes that nothing changes alone
+        mode, weights, moves = (jnp.where(is_one[:, None], x, 0.0) for x in (mode, weights, moves.T))
+        moves = moves.T / lengths[:, None]
         ahead = (weights * near.times[index]) @ near.rows[index]
         return _Events(is_one, mode * lengths, ahead, moves, moves @ to_middle, widths, weights, index)
+
+    def _moving(
+        self, mode: Array, is_one: Array, scaled: Array, free: Float[Array, " all"], widths: Array, to_middle: Array
+    ) -> Float[Array, "nv modes"]:
+        """Return scaled displacements that change one mode alone and, where that can be, carry no free row across zero.
+
+        Args:
+            mode: what each changes.
+            is_one: which are any.
+            scaled: all rows.
+            free: how far from zero those are that take no part in events; infinite of others.
+            widths: of each mode.
+            to_middle: displacements of all modes from here to the middle of each.
+        """
+        sizes = jnp.linalg.norm(scaled, axis=1)
+        distance = jnp.where(sizes > 0, free / jnp.where(sizes > 0, sizes, 1.0), jnp.inf)
+        nearest, kept = jax.lax.top_k(-distance, min(_MOST_HELD, len(distance)))
+        rows, gaps, is_any = scaled[kept], free[kept], jnp.isfinite(nearest)
+        gram, across = rows @ rows.T, rows @ mode.T
+        unit, tiny = jnp.eye(len(mode), dtype=self.dtype), 10 * jnp.finfo(self.dtype).eps
+
+        def alone(rest: Float[Array, "modes nv"]) -> Float[Array, "nv modes"]:
+            square = jnp.where(is_one[:, None] & is_one, rest @ mode.T, 0.0)
+            square += unit * (tiny * jnp.diag(square) + jnp.where(is_one, 0.0, 1.0))
+            return cholesky.written_out(square[..., None], rest).T
+
+        def holding(is_held: Bool[Array, " rows"]) -> Float[Array, "nv modes"]:
+            # Rows that are held may depend on each other.
+            held = jnp.where(is_held[:, None] & is_held, gram, 0.0)
+            held += jnp.diag(jnp.where(is_held, _LOOSE * jnp.diag(gram), 1.0))
+            rest = mode - cholesky.written_out(held[..., None], jnp.where(is_held[:, None], across, 0.0)).T @ rows
+            # A mode that hardly moves without them carries them along.
+            can_hold = jnp.all(~is_one | (jnp.sum(rest**2, axis=1) > 1 / slope.FARTHEST**2))
+            return alone(jnp.where(can_hold, rest, mode))
+
+        moves, is_held = alone(mode), jnp.zeros(len(rows), bool)
+        for _ in range(_NUM_HOLDS):
+            moved = rows @ moves
+            is_held |= is_any & (gaps < jnp.max(jnp.abs(moved) * widths + jnp.abs(moved @ to_middle), axis=1))
+            moves = holding(is_held)
+        return moves
 
     def _felt(self, events: _Events) -> Float[Array, "modes size"]:
         rest = jnp.zeros((len(events.rows), self.size - 2 * self.nv), self.dtype)
@@ -386,39 +405,83 @@ class _Step:
         begins = jnp.any(places, axis=1)
         return _Plan(goes_on & ~begins, begins, places.astype(self.dtype)), reach
 
-    def _go_on(self, events: _Events, plan: _Plan) -> tuple[Motion, Array, Array]:
-        """Return both motions of all pairs after the step, how far apart they began, and D."""
-        model, flight = self.model, self.flight
+    def _go_on(
+        self, events: _Events, plan: _Plan, changes: Float[Array, "slots 2 size"], moved: Motion
+    ) -> tuple[Motion, Array, Array, Float[Array, "slots 2 size"]]:
+        """Return both motions of all pairs after the step, how far apart they began, D, and A times changes.
+
+        A is known by small differences of the motion, which are two more motions to step: its linear program would have to be
+        compiled once more.
+
+        Args:
+            events: those of the step.
+            plan: who goes on and who begins.
+            changes: by which A is multiplied; the second ones matter beside an event alone.
+            moved: the motion after the step.
+        """
+        flight = self.flight
         shift = events.moves * events.widths
-        changes = jnp.stack([events.middles + shift, events.middles - shift])  # sides nv modes
-        changes = jnp.einsum("evm,sm->sev", changes, plan.places)
+        displaced = jnp.stack([events.middles + shift, events.middles - shift])  # sides nv modes
+        displaced = jnp.einsum("evm,sm->sev", displaced, plan.places)
+        displaced = jnp.pad(displaced, ((0, 0), (0, 0), (0, self.size - self.nv)))
         # A free slot repeats the motion.
-        started = jax.vmap(jax.vmap(lambda x: integrate_position(model, self.now.qpos, x, 1.0)))(changes)
         goes_on = plan.goes_on[:, None, None]
-        fresh = Motion(started, self.now.qvel, self.now.act)
-        starts = Motion(*(jnp.where(goes_on, x, y) for x, y in zip(flight.ends, fresh, strict=True)))
+        ends = self._displaced(displaced)
+        starts = Motion(*(jnp.where(goes_on, x, y) for x, y in zip(flight.ends, ends, strict=True)))
+        small = self._small(changes)
+        starts = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), starts, self._displaced(small * changes))
+        both, is_any = plan.goes_on | plan.begins, jnp.any(events.is_one)
+        is_wanted = jnp.stack([both, both, plan.goes_on, plan.goes_on & is_any], axis=1)
 
-        def step(starts: Motion, given: list[Array]) -> Motion:
-            return jax.vmap(lambda motion: taken(self.program.step(*self.program.put(given, motion))))(starts)
+        def step(start: Motion, given: list[Array]) -> Motion:
+            return taken(self.program.step(*self.program.put(given, start)))
 
-        ends = sparsely(step, plan.goes_on | plan.begins, starts, self.still)
-        widths = jnp.where(plan.goes_on, flight.widths, plan.places @ (2 * events.widths))
+        flat = jax.tree.map(lambda x: x.reshape(is_wanted.size, x.shape[-1]), starts)
+        found = sparsely(step, is_wanted.ravel(), flat, self.still)
+        ends = jax.tree.map(lambda x, y: x.reshape(y.shape), found, starts)
         one, other = (jax.tree.map(lambda x, side=side: x[:, side], ends) for side in (0, 1))
-        by_position = jax.vmap(lambda x, y: position_change(model, y, x))(one.qpos, other.qpos)
-        apart = jnp.concatenate([by_position, one.qvel - other.qvel, one.act - other.act], axis=1)
+        widths = jnp.where(plan.goes_on, flight.widths, plan.places @ (2 * events.widths))
+        apart = jax.vmap(self._difference)(one, other)
         is_sound = (widths > 0) & jnp.all(jnp.isfinite(apart), axis=1)
         apart = jnp.where(is_sound[:, None], apart, 0.0) / jnp.where(is_sound, widths, 1.0)[:, None]
-        return ends, jnp.where(is_sound, widths, 0.0), apart
+        sides = jax.tree.map(lambda x: x[:, 2:], ends)
+        away = jax.vmap(jax.vmap(lambda side: self._difference(side, moved)))(sides) / small
+        expected = jnp.where(is_wanted[:, 2:, None], away, 0.0)
+        ends = jax.tree.map(lambda x: x[:, :2], ends)
+        expected = expected.at[:, 1].set(jnp.where(is_any, expected[:, 1], expected[:, 0]))
+        return ends, jnp.where(is_sound, widths, 0.0), apart, expected
+
+    def _displaced(self, changes: Float[Array, "slots 2 size"]) -> Motion:
+        """Return motions that lie changes away from this one."""
+        by_position, by_speed, by_act = jnp.split(changes, [self.nv, 2 * self.nv], axis=-1)
+        qpos = jax.vmap(jax.vmap(lambda x: integrate_position(self.model, self.now.qpos, x, 1.0)))(by_position)
+        return Motion(qpos, self.now.qvel + by_speed, self.now.act + by_act)
+
+    def _small(self, changes: Float[Array, "slots 2 size"]) -> Float[Array, "slots 2 1"]:
+        """Return factors that make changes small."""
+        lengths, widths = self.flight.lengths, _SMALL if self.dtype == jnp.float64 else _SMALL_IN_SINGLE
+        scale = jnp.concatenate(
+            [lengths / widths[0], lengths / widths[1], jnp.full(self.size - 2 * self.nv, 1 / widths[1])]
+        )
+        largest = jnp.max(scale * jnp.abs(changes), axis=-1, keepdims=True)
+        return 1 / jnp.where(largest > 0, largest, 1.0)
+
+    def _difference(self, one: Motion, other: Motion) -> _Change:
+        by_position = position_change(self.model, other.qpos, one.qpos)
+        return jnp.concatenate([by_position, one.qvel - other.qvel, one.act - other.act])
 
     def _is_explained(
-        self, events: _Events, plan: _Plan, reach: Array, apart: Float[Array, "slots size"], carried: Any
+        self,
+        events: _Events,
+        plan: _Plan,
+        reach: Array,
+        apart: Array,
+        felt: Array,
+        expected: Float[Array, "slots 2 size"],
     ) -> Bool[Array, " slots"]:
         """Return whether the derivative along the motion says how pairs differ, but for events that lie between the two."""
-        before = self.flight.apart
-        felt = before @ self._felt(events).T  # slots modes
-        rest = before.at[:, : self.nv].add(-felt @ events.moves.T)
-        plain, expected = jnp.swapaxes(carried(jnp.stack([before, rest], axis=1), plan.goes_on), 0, 1)
-        off = self._scaled(apart - expected - felt @ (plan.places.T @ apart))
+        plain, rest = expected[:, 0], expected[:, 1]
+        off = self._scaled(apart - rest - felt @ (plan.places.T @ apart))
         is_beside = jnp.all(~events.is_one[:, None] | (reach <= 2 * slope.BESIDE * events.widths[:, None]), axis=0)
         off = jnp.where(is_beside, jnp.minimum(off, self._scaled(apart - plain)), off)
         return off <= slope.ALIKE * self._scaled(apart)

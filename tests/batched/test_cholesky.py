@@ -29,6 +29,12 @@ def test_solves_every_member_of_the_batch(way, size: int, num: int):
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
+def test_vectors_share_a_matrix():
+    matrices, vectors = _systems(5, 7)
+    found = jax.jit(cholesky.written_out)(matrices[0][..., None], vectors.T)
+    np.testing.assert_allclose(found, np.linalg.solve(matrices[0], vectors.T), rtol=1e-10, atol=1e-12)
+
+
 @pytest.mark.parametrize("way", _WAYS.values(), ids=_WAYS)
 def test_an_indefinite_member_is_not_finite_and_its_neighbour_is_right(way):
     matrices, vectors = _systems(6, 2)
