@@ -20,6 +20,8 @@ Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
 """Function from policy parameters and the state or observations to controls."""
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 """Function from model and data to a pytree of arrays."""
+Inputs = dict[str, Array]
+"""Inputs of a step beside controls, by MuJoCo's names."""
 Sees = Literal["state", "observations"]
 
 
@@ -76,6 +78,12 @@ class Engine(Protocol):
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
         """Return the state after a control was held for some steps; differentiable."""
+        ...
+
+    def look(
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
+    ) -> PyTree:
+        """Return what a function of model and data sees in a state under a control and other inputs; differentiable."""
         ...
 
 

@@ -23,6 +23,8 @@ from mjxgrad.engines.stepmap import FIRST, PAIRS
 from mjxgrad.engines.steps import Stepper
 from mjxgrad.stepping import slope
 
+# Stages of a step that are done.
+_NONE, _PLACES, _SPEEDS = (getattr(mujoco.mjtStage, f"mjSTAGE_{name}").value for name in ("NONE", "POS", "VEL"))
 WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
 # How the names of model arrays and inputs end that move surfaces.
@@ -407,29 +409,35 @@ class Worker:
             else:
                 self._by_sensors(row, found)
 
-    def _read(self, row: np.ndarray) -> Float[np.ndarray, " sensors"]:
+    def _read(self, row: np.ndarray, done: int = _NONE) -> Float[np.ndarray, " sensors"]:
+        """Return the readings in a state; `done` says which stages are those of the last state that was read."""
         model, data = self.inverse.model, self.inverse.data
         mujoco.mj_setState(model, data, row, EVERY)
-        mujoco.mj_forward(model, data)
+        mujoco.mj_forwardSkip(model, data, done, False)
         return data.sensordata.copy()
 
     def _by_sensors(self, row: np.ndarray, found: _Found) -> None:
-        """Write small differences of sensors by state, controls, other inputs and numbers."""
-        model, data, place = self.inverse.model, self.inverse.data, self.layout.places["ctrl"]
-        by_state, by_control = found["state"], found.get("ctrl", np.zeros((model.nsensordata, model.nu)))
-        if (
-            self.layout.num_changes == 2 * model.nv + model.na
-            and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
-        ):
-            mujoco.mj_setState(model, data, row, EVERY)
-            mujoco.mjd_transitionFD(model, data, WIDTH, True, None, None, by_state, by_control)
-        else:
-            changes = WIDTH * np.eye(self.layout.num_changes)
-            starts = [(by_state, self.layout.moved(row, changes), self.layout.moved(row, -changes))]
-            starts += [(by_control, row + (change := WIDTH * np.eye(len(row))[place]), row - change)]
-            for matrix, *sides in starts:
-                for column, (above, below) in enumerate(zip(*sides, strict=True)):
-                    matrix[:, column] = (self._read(above) - self._read(below)) / (2 * WIDTH)
+        """Write small differences of sensors by state, controls, other inputs and numbers.
+
+        `mjd_transitionFD` of MuJoCo 3.17, centred, gives those by controls the wrong sign.
+        """
+        model, layout, place = self.inverse.model, self.layout, self.layout.places["ctrl"]
+        self._read(row)
+        # What needs fewer stages comes first, while those of the row are known.
+        for column in range(model.nu if "ctrl" in found else 0):
+            own, ends = slice(column, column + 1), []
+            up, down, width = self.inverse.sides(row[place][own], WIDTH, own)
+            for value in (up, down):
+                moved = row.copy()
+                moved[place][own] = value
+                ends.append(self._read(moved, _SPEEDS))
+            found["ctrl"][:, column] = (ends[0] - ends[1]) / width
+        is_plain = layout.num_changes == 2 * model.nv + model.na  # without histories of delays
+        for column in [*range(model.nv, layout.num_changes), *range(model.nv)]:
+            change = WIDTH * np.eye(1, layout.num_changes, column)
+            done = _PLACES if is_plain and column >= model.nv else _NONE
+            above, below = (self._read(layout.moved(row, side * change)[0], done) for side in (1.0, -1.0))
+            found["state"][:, column] = (above - below) / (2 * WIDTH)
         for name in (one for one in found if is_other(one)):
             for column, (put, size, is_zero) in enumerate(self._changes(self.inverse, row, name)):
                 read = lambda amount, put=put: self._read(put(amount))  # noqa: E731

@@ -17,7 +17,7 @@ from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import first_missed, slot_geoms
 from mjxgrad.engines.agreement import parting
-from mjxgrad.engines.engine import Motion, Rows, one_each
+from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows, one_each
 from mjxgrad.engines.state import State, Trajectory, data_of, direction, is_sound, state_of
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
@@ -53,6 +53,13 @@ class MJX:
 
         first = _Moving.at(scene, state, contact)
         return jax.lax.scan(advance, first, None, length=num_steps)[0].end(scene.model, state)
+
+    def look(
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
+    ) -> PyTree:
+        return observe(
+            scene.model, forward(scene.model, data_of(scene, state, ctrl).replace(**inputs), contact=contact)
+        )
 
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
@@ -203,10 +210,11 @@ class _Scan(Motion):
         """Return the observations in a state under a control, from the data of a step where it is given."""
         if self.observe is None:
             return None
-        model, data = self.scene.model, data_of(self.scene, state, ctrl).replace(**forces)
+        model = self.scene.model
         has_stages = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         if stepped is None or has_stages:  # data of a multi-stage step belongs to its last stage
-            return self.observe(model, forward(model, data, contact=self.contact))
+            return MJX().look(self.scene, state, ctrl, forces, self.observe, self.contact)
+        data = data_of(self.scene, state, ctrl)
         at_start = {name: getattr(data, name) for name in ("qpos", "qvel", "act", "time")}
         return self.observe(model, stepped.replace(**at_start))
 

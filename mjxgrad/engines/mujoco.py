@@ -14,7 +14,7 @@ from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import com_pos, kinematics
 from mjxgrad.engines import rule
-from mjxgrad.engines.engine import Motion, Observe, Rows, one_each
+from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows, one_each
 from mjxgrad.engines.layout import INPUTS, MOTION
 from mjxgrad.engines.pool import pool_of
 from mjxgrad.engines.state import Pairs, State, Trajectory, data_of, direction, is_sound
@@ -22,7 +22,6 @@ from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Contact, Discrete, Gradient, Slope
 
-_Inputs = dict[str, Array]
 _PLACES = (
     "xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat",
     "subtree_com",
@@ -63,6 +62,12 @@ class MuJoCo:
         final = final if given.history.size == final.history.size else dataclasses.replace(final, history=given.history)
         return dataclasses.replace(found, growth=growth, final=final, observations=observations, seen=seen)
 
+    def look(
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
+    ) -> PyTree:
+        """Return what a function of model and data sees: sensors, and places of bodies, geoms and sites; the rest is NaN."""
+        return _observed(scene, self.complete(scene, state), ctrl, inputs, observe)
+
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
     ) -> tuple[Array, Array, Array, Array]:
@@ -95,11 +100,11 @@ class MuJoCo:
         start, resting = self._arguments(scene, state)
         return rule.steer(scene, {"time": start["time"], **resting}, law, num_steps)
 
-    def _arguments(self, scene: Scene, state: State) -> tuple[_Inputs, _Inputs]:
+    def _arguments(self, scene: Scene, state: State) -> tuple[Inputs, Inputs]:
         return _arguments(scene, self.complete(scene, state))
 
 
-def _arguments(scene: Scene, state: State) -> tuple[_Inputs, _Inputs]:
+def _arguments(scene: Scene, state: State) -> tuple[Inputs, Inputs]:
     """Return a complete state, and the scene's inputs beside controls where they are not those of its file."""
     pool = pool_of(scene.mj_model)
     size = pool.first["history"].size
@@ -152,7 +157,7 @@ class _Fixed:
 
 
 def _course(
-    scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: _Inputs, gradient: Gradient
+    scene: Scene, state: State, ctrl: Float[Array, "horizon nu"], inputs: Inputs, gradient: Gradient
 ) -> tuple[Trajectory, Float[Array, "states _"]]:
     """Return the motion under known controls, and what else goes on: one call of C MuJoCo."""
     numbers, (start, resting) = changed_numbers(scene), _arguments(scene, state)
@@ -161,7 +166,7 @@ def _course(
 
 @eqx.filter_jit
 def _steps(
-    fixed: _Fixed, numbers: _Inputs, start: _Inputs, inputs: _Inputs, state: State, ctrl: Float[Array, "horizon nu"],
+    fixed: _Fixed, numbers: Inputs, start: Inputs, inputs: Inputs, state: State, ctrl: Float[Array, "horizon nu"],
     gradient: Gradient,
 ) -> tuple[Trajectory, Float[Array, "states _"]]:  # fmt: skip
     is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
@@ -194,7 +199,7 @@ def _trajectory(
     return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act)  # pyright: ignore[reportCallIssue]
 
 
-def _growth(scene: Scene, state: State, ctrl: Array, inputs: _Inputs, gradient: Gradient) -> Float[Array, ""]:
+def _growth(scene: Scene, state: State, ctrl: Array, inputs: Inputs, gradient: Gradient) -> Float[Array, ""]:
     """Return the growth of a tangent of the start; it has no derivative."""
     fixed = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x  # noqa: E731
     scene, state, ctrl, inputs = jax.tree.map(fixed, (scene, state, ctrl, inputs))
@@ -209,7 +214,7 @@ def _growth(scene: Scene, state: State, ctrl: Array, inputs: _Inputs, gradient: 
 
 
 def _observations(
-    scene: Scene, start: State, found: Trajectory, history: Float[Array, "states _"], inputs: _Inputs, observe: Observe
+    scene: Scene, start: State, found: Trajectory, history: Float[Array, "states _"], inputs: Inputs, observe: Observe
 ) -> PyTree:
     """Return what is observed in each state of a motion, the last one under the last control."""
     assert found.act is not None
@@ -220,7 +225,7 @@ def _observations(
     return jax.vmap(look)(states, found.ctrl[steps], jax.tree.map(lambda x: x[steps], inputs))
 
 
-def _observed(scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: _Inputs, observe: Observe) -> PyTree:
+def _observed(scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe) -> PyTree:
     """Return what a function of model and data sees in a state under a control: sensors, and places of bodies, geoms, sites."""
     start, resting = _arguments(scene, state)
     given = {name: value[None] for name, value in (resting | inputs | {"ctrl": ctrl}).items()}

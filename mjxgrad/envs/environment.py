@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import instance, one_key, real, whole
 from mjxgrad.engines import engine_of
+from mjxgrad.engines.engine import Observe
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -128,6 +129,20 @@ class Environment(InScene):
         is_bounded = jnp.isfinite(high - low)
         middle, half = (jnp.where(is_bounded, x / 2, y) for x, y in ((low + high, 0.0), (high - low, 1.0)))
         return middle + half * action
+
+    def look(self, state: State, observe: Observe, action: Float[Array, " nu"] | None = None) -> PyTree:
+        """Return what a function of model and data sees in a state, such as `mg.sensor(model, data, "touch")`.
+
+        `observe`, `privileged` and `rewards` call it for what a state does not tell: sensors, and places of bodies, geoms and
+        sites, by either engine; with MJX forces, too. It takes a step's time without its integration, so call it once.
+
+        Args:
+            state: positions, velocities and activations.
+            observe: the function.
+            action: on which accelerations and forces depend; by default 0.
+        """
+        controls = self.control(jnp.zeros(self.num_actions, state.qpos.dtype) if action is None else action)
+        return engine_of(self.scene, self.contact).look(self.scene, state, controls, {}, observe, self.contact)
 
     @property
     def num_actions(self) -> int:

@@ -34,7 +34,7 @@ def linearise(
     """Return the linear model of one step from a state; use `jax.vmap` for a batch of states.
 
     The controls are the scene's resting ones by default. Contact is stepped as in `rollout`: the default is the model of the
-    outcome, and `mg.Discrete()` corresponds to `mjd_transitionFD`.
+    outcome, and `mg.Discrete()` corresponds to `mjd_transitionFD`, whose D by MuJoCo 3.17 has the wrong sign if centred.
 
     Raises:
         ValueError: as `rollout`.

@@ -57,6 +57,7 @@ class Scene(eqx.Module):
         name: source of the scene.
         unsupported: reason why MJX cannot step it, so that C MuJoCo does; empty if MJX can.
         chosen: the engine that `with_engine` chose; None for the default.
+        more: numbers of the C model that MJX lacks and `with_model` changed, by MuJoCo's names, such as "geom_surfacevel".
     """
 
     model: mjx.Model
@@ -68,6 +69,7 @@ class Scene(eqx.Module):
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
     chosen: EngineName | None = eqx.field(static=True, default=None)
+    more: dict[str, Array] = eqx.field(default_factory=dict)
 
     @property
     def engine(self) -> EngineName:
@@ -107,12 +109,13 @@ class Scene(eqx.Module):
         return scene
 
     def with_model(self, **fields: Float[ArrayLike, "..."]) -> "Scene":
-        """Return the scene with other numbers of the MJX model, such as `geom_friction`, `timestep`, `gravity` or `wind`.
+        """Return the scene with other numbers of the model, such as `geom_friction`, `timestep`, `gravity` or `wind`.
 
         The fields are the model's floating-point arrays, and of the options the time step (s), gravity (m/s²) and wind (m/s),
         which acts only in a medium. Differentiable by the new values, and traceable. Shapes stay, so `jax.vmap` makes a batch of
         scenes. Constants that MuJoCo derives from masses, inertias, lengths and sizes are updated, unless they are given, too;
-        see `mg.set_const`.
+        see `mg.set_const`. Where C MuJoCo steps the scene, its other arrays and options have the same right, such as
+        `geom_surfacevel`, `actuator_damping`, `density` or `impratio`; MJX then refuses the scene.
 
         Raises:
             ValueError: if there is no such field, it is not an array of numbers, or the shape differs. Known values are also
@@ -122,6 +125,11 @@ class Scene(eqx.Module):
         every = numbers_of(self.model)
         options = {name: every[f"opt.{name}"] for name in _OPTIONS}
         arrays = {name: value for name, value in every.items() if "." not in name} | options
+        native = {k: jnp.asarray(v, self.data.qpos.dtype) for k, v in _native(self.mj_model).items() if k not in arrays}
+        chosen = [name for name in fields if name in native]
+        if chosen and self.engine == "mjx":
+            raise ValueError(f'MJX cannot change {" and ".join(chosen)}: take scene.with_engine("mujoco")')
+        arrays |= native if self.engine == "mujoco" else {}
         fields = {name: real(name, value) for name, value in fields.items()}
         for name, value in fields.items():
             if name not in arrays:
@@ -145,14 +153,19 @@ class Scene(eqx.Module):
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
         if "dof_damping" in fields and is_explicit:
             _warn(self, "loaded undamped, so dof_damping is integrated explicitly; load with keep_everything=True")
-        chosen = {f"opt.{name}": changed.pop(name) for name in _OPTIONS if name in changed}
-        model, derived = self.model.replace(**changed).tree_replace(chosen), {}  # pyright: ignore[reportArgumentType]
+        scene = self
+        if more := {name: changed.pop(name) for name in chosen}:
+            named = {f"opt.{name}" if hasattr(self.mj_model.opt, name) else name: value for name, value in more.items()}
+            reason = self.unsupported or f"with_model changed {' and '.join(chosen)}, which MJX does not have"
+            scene = dataclasses.replace(self, more=self.more | named, unsupported=reason)
+        options = {f"opt.{name}": changed.pop(name) for name in _OPTIONS if name in changed}
+        model, derived = self.model.replace(**changed).tree_replace(options), {}  # pyright: ignore[reportArgumentType]
         if constants.CAUSES & fields.keys():
             # Only these, so that other fields stay known while the model is traced.
             derived = jax.jit(constants.constants_of)(model)
         elif "geom_size" in fields:
             derived = {"geom_rbound": constants.bounding_radii(model)}  # pyright: ignore[reportArgumentType]
-        return eqx.tree_at(lambda s: s.model, self, model.replace(**derived | changed))
+        return eqx.tree_at(lambda s: s.model, scene, model.replace(**derived | changed))
 
     @property
     def ctrlrange(self) -> Float[Array, "nu 2"]:
@@ -173,7 +186,7 @@ class Scene(eqx.Module):
         Raises:
             ValueError: if the scene is batched or traced.
         """
-        numbers = numbers_of(self.model)
+        numbers = numbers_of(self.model) | self.more
         if any(isinstance(value, jax.core.Tracer) for value in numbers.values()):
             raise ValueError("to_mujoco needs known values, got a traced scene")
         return with_numbers(self.mj_model, numbers)
@@ -229,7 +242,14 @@ def changed_numbers(scene: "Scene") -> dict[str, Array]:
         given = np.asarray(getattr(holder, name.removeprefix("opt."), value))
         return not is_known(value) or not np.array_equal(np.ravel(value), np.ravel(given).astype(value.dtype))
 
-    return {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)}
+    return {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)} | scene.more
+
+
+def _native(model: mujoco.MjModel) -> dict[str, np.ndarray | float]:
+    """Return the numbers of a C model by MuJoCo's names, its options among them."""
+    every = {name: getattr(part, name) for part in (model, model.opt) for name in dir(part) if not name.startswith("_")}
+    is_array = lambda value: isinstance(value, np.ndarray) and value.size and value.dtype == np.float64  # noqa: E731
+    return {name: value for name, value in every.items() if isinstance(value, float) or is_array(value)}
 
 
 def _heading(scene: Scene) -> str:

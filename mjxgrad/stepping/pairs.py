@@ -351,11 +351,11 @@ class _Step:
         """Return scaled displacements that change one mode alone and, where that can be, carry no free row across zero.
 
         Args:
-            mode: what each changes.
+            mode: one row of scaled changes for each.
             is_one: which are any.
             scaled: all rows.
             free: how far from zero those are that take no part in events; infinite of others.
-            widths: of each mode.
+            widths: one for each mode.
             to_middle: displacements of all modes from here to the middle of each.
         """
         sizes = jnp.linalg.norm(scaled, axis=1)
@@ -416,7 +416,7 @@ class _Step:
         Args:
             events: those of the step.
             plan: who goes on and who begins.
-            changes: by which A is multiplied; the second ones matter beside an event alone.
+            changes: two for each slot, which A multiplies; the second ones matter beside an event alone.
             moved: the motion after the step.
         """
         flight = self.flight

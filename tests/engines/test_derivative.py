@@ -289,3 +289,50 @@ def test_a_step_is_differentiated_on_its_own_side_of_a_gap_smaller_than_differen
             state, by_mjx, atol=1e-2 * np.abs(by_mjx).max()
         )  # 4 µm from it, the impedance differs
         assert (abs(state[1, 0]) < 1e-6) == (gap > 0)  # a force that pushes back
+
+
+BELT = f"""<mujoco><option density="2" viscosity=".1" cone="elliptic" {_SOLVER}/><worldbody>
+  <geom type="plane" size="5 5 .1" surfacevel=".2 0 0 0 0 0"/>
+  <body pos="0 0 .0999"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>
+  <body pos="0 2 1"><joint name="j" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"/></body></worldbody>
+  <actuator><motor joint="j" damping=".1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["geom_surfacevel", "actuator_damping", "density", "impratio"])
+def test_numbers_that_only_c_mujoco_has_are_changed_and_differentiated_by(name):
+    """A belt that carries a box, and an arm in a medium; against C MuJoCo with the number set by hand, from a fresh MjData."""
+    scene, steps, width = mg.load_scene(BELT), 40, 1e-5
+
+    def by_hand(value):
+        model = mujoco.MjModel.from_xml_string(BELT)
+        holder = model if hasattr(model, name) else model.opt
+        setattr(holder, name, value)
+        data = mujoco.MjData(model)
+        data.qvel[1], data.ctrl[:] = 0.3, 0.5
+        mujoco.mj_step(model, data, steps)
+        return data.qpos.copy()
+
+    @jax.jit
+    def ours(value):
+        start = mg.initial_state(scene, qvel=jnp.zeros(7).at[1].set(0.3))
+        return mg.rollout(scene.with_model(**{name: value}), start, jnp.full((steps, 1), 0.5)).qpos[-1]
+
+    given = getattr(scene.mj_model if hasattr(scene.mj_model, name) else scene.mj_model.opt, name)
+    given = np.array(given, float)
+    change = np.zeros_like(given)
+    change.flat[0] = 1.0
+    np.testing.assert_allclose(ours(given + 0.1 * change), by_hand(given + 0.1 * change), atol=1e-12)
+    expected = (by_hand(given + width * change) - by_hand(given - width * change)) / (2 * width)
+    found = jax.jvp(ours, (jnp.asarray(given),), (jnp.asarray(change),))[1]
+    assert np.abs(expected).max() > 1e-6
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_mjx_refuses_numbers_that_it_lacks():
+    scene = mg.load_scene(scene_path("cartpole"))
+    with pytest.raises(ValueError, match="MJX cannot change impratio: take scene"):
+        scene.with_model(impratio=2.0)
+    changed = scene.with_engine("mujoco").with_model(impratio=2.0)
+    with pytest.raises(mg.scene.SceneError, match="with_model changed impratio, which MJX does not have"):
+        changed.with_engine("mjx")
+    assert changed.to_mujoco().opt.impratio == 2.0

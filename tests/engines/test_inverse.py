@@ -104,3 +104,40 @@ def test_a_control_at_its_limit_has_the_derivative_of_its_inside():
     np.testing.assert_allclose(at_limit, inside, rtol=1e-6)
     assert inside > 0
     assert beyond == 0.0
+
+
+WALKER = """<mujoco><option timestep=".005" integrator="implicitfast"/><worldbody><geom type="plane" size="5 5 .1"/>
+  <body name="trunk" pos="0 0 .298"><freejoint/><geom type="box" size=".1 .1 .05" mass="1"/><site name="imu" pos=".05 0 .03"/>
+    <body pos="0 0 -.05"><joint name="hip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".05" mass=".2"/>
+      <site name="sole" pos="0 0 -.2" size=".06"/></body></body></worldbody>
+  <actuator><motor name="m" joint="hip" ctrlrange="-1 1" gear="3"/><general joint="hip" dyntype="filter" dynprm=".1" gainprm="2"/>
+  </actuator>
+  <sensor><accelerometer site="imu"/><gyro site="imu"/><framepos objtype="site" objname="sole"/><touch site="sole"/>
+    <force site="sole"/><actuatorfrc actuator="m"/><jointpos joint="hip"/><velocimeter site="imu"/></sensor></mujoco>"""
+
+
+@pytest.mark.parametrize("control", [0.3, 1.0], ids=["within its range", "at its end, where it moves inwards"])
+def test_sensors_have_the_derivative_of_whole_readings(control):
+    """In contact; `mjd_transitionFD` of MuJoCo 3.17, centred, has the wrong sign by controls."""
+    model, size, width = mujoco.MjModel.from_xml_string(WALKER), 17, 1e-6
+    model.opt.tolerance = 1e-14
+    random = np.random.default_rng(0)
+    qvel, act, ctrl = 0.1 * random.normal(size=7), np.array([0.2]), np.array([control, 0.5])
+
+    def read(change):
+        data = mujoco.MjData(model)
+        data.qvel, data.act, data.ctrl = qvel + change[7:14], act + change[14], ctrl + change[15:]
+        mujoco.mj_integratePos(model, data.qpos, change[:7], 1.0)
+        mujoco.mj_forward(model, data)
+        return data.sensordata.copy()
+
+    expected = np.empty((model.nsensordata, size))
+    for column, change in enumerate(width * np.eye(size)):
+        above = 0.0 * change if column == 15 and control == 1.0 else change
+        expected[:, column] = (read(above) - read(-change)) / (width + above.max())
+    states = {"time": [[0.0]], "qpos": [model.qpos0], "qvel": [qvel], "act": [act]}
+    states = {name: np.array(value, float) for name, value in states.items()}
+    found = Pool(model).sense({}, states, {"ctrl": ctrl[None]}, wanted=("state", "ctrl"))
+    found = np.concatenate([found["state"][0], found["ctrl"][0]], axis=1)
+    assert np.abs(expected[:, 15]).max() > 1
+    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from mjxgrad.envs import Environment
 from mjxgrad.envs.diffrl import CartPole
 from mjxgrad.rollouts import rollout
 from mjxgrad.scene import load_scene
+from mjxgrad.stepping import Slope
 from mjxgrad.tasks import scene_path
 from tests.scenes import central_difference
 
@@ -182,3 +184,54 @@ def test_the_gradient_of_a_return_is_its_slope(cart, state):
 
     both = jax.jit(lambda actions: (jax.grad(total)(actions), central_difference(total, actions, 1e-5)))
     np.testing.assert_allclose(*both(ACTIONS[:, 0]), rtol=1e-7)
+
+
+FELT = """<mujoco><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .101"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="ball" size=".1" mass="1"/><site name="sole" pos="0 0 -.1" size=".02"/></body></worldbody>
+    <actuator><motor joint="z" ctrlrange="-5 5"/></actuator>
+    <sensor><framepos objtype="site" objname="sole"/><accelerometer site="sole"/></sensor></mujoco>"""
+
+
+class Felt(Environment):
+    """Sees where its sole is, and is paid for what it feels there under its action."""
+
+    def observe(self, state, memory):
+        return self.look(state, lambda model, data: data.sensordata)
+
+    def rewards(self, before, action, after, memory):
+        return {"felt": self.look(after, lambda model, data: data.sensordata[5], action)}
+
+
+@pytest.mark.parametrize("engine", ["mjx", "mujoco"])
+def test_sensors_are_seen_and_rewarded_by_either_engine(engine):
+    """As C MuJoCo reads them, in the air and after the landing; the reward's derivative is that of differences."""
+    env = Felt(load_scene(FELT, engine=engine), frame_skip=10)
+    start = jax.jit(lambda key: env.reset(key))(jax.random.key(0))
+    step = jax.jit(lambda action: env.step(start, action))
+    data = mujoco.MjData(model := mujoco.MjModel.from_xml_string(FELT))
+    mujoco.mj_forward(model, data)
+    assert_allclose(start.obs, data.sensordata, rtol=1e-12, atol=1e-12)
+    for action in (-0.8, 0.4):
+        mujoco.mj_resetData(model, data)
+        data.ctrl[:] = 5 * action
+        mujoco.mj_step(model, data, 10)
+        mujoco.mj_forward(model, data)
+        stepped = step(jnp.array([action]))
+        assert_allclose(stepped.reward, data.sensordata[5], rtol=1e-8)
+        data.ctrl[:] = 0
+        mujoco.mj_forward(model, data)
+        assert_allclose(stepped.obs, data.sensordata, rtol=1e-8, atol=1e-12)
+    reward = lambda action: step(action).reward  # noqa: E731
+    expected = central_difference(reward, jnp.array([0.4]), 1e-5)
+    assert_allclose(jax.grad(reward)(jnp.array([0.4])), expected, rtol=1e-5)  # differences of C MuJoCo's sensors
+
+
+def test_a_state_from_another_contact_goes_on_under_a_slope():
+    """Steps of MuJoCo's own derivative have no pairs of motions; an episode that ends has them no less."""
+    plain = Felt(load_scene(FELT), frame_skip=2, episode_length=1)
+    sloped = plain.with_contact(Slope())
+    state = jax.jit(lambda key: plain.reset(key))(jax.random.key(0))
+    go_on = jax.jit(lambda state, action: sloped.step_on(state, action)[1].physics.qpos)
+    assert_allclose(go_on(state, jnp.zeros(1)), 0.0)
+    completed = dataclasses.replace(state, physics=sloped.completed(state.physics))
+    assert_allclose(go_on(completed, jnp.zeros(1)), 0.0)
