@@ -281,13 +281,21 @@ def test_a_step_is_differentiated_on_its_own_side_of_a_gap_smaller_than_differen
     """A ball at 10 nm above the floor falls freely in a step; at 10 nm below it is pushed out."""
     scene = mg.load_scene("""<mujoco><worldbody><geom type="plane" size="9 9 1"/>
       <body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>""")
+
+    def linearised(engine):
+        by = scene.with_engine(engine)
+
+        def of(gap):
+            start = mg.initial_state(by, qpos=gap[None], qvel=jnp.array([-0.1]))
+            return mg.linearise(by, start, contact=mg.Discrete()).A
+
+        return jax.jit(of)
+
+    by_mujoco, by_mjx = linearised("mujoco"), linearised("mjx")
     for gap in (1e-8, -1e-8):
-        start = mg.initial_state(scene, qpos=np.array([gap]), qvel=np.array([-0.1]))
-        by = (scene.with_engine(name) for name in ("mujoco", "mjx"))
-        state, by_mjx = (mg.linearise(one, start, contact=mg.Discrete()).A for one in by)
-        np.testing.assert_allclose(
-            state, by_mjx, atol=1e-2 * np.abs(by_mjx).max()
-        )  # 4 µm from it, the impedance differs
+        state, expected = by_mujoco(jnp.array(gap)), by_mjx(jnp.array(gap))
+        # 4 µm from it, the impedance differs.
+        np.testing.assert_allclose(state, expected, atol=1e-2 * np.abs(expected).max())
         assert (abs(state[1, 0]) < 1e-6) == (gap > 0)  # a force that pushes back
 
 

@@ -103,7 +103,7 @@ def test_derivatives_that_are_no_numbers_are_counted_and_replaced(cartpole, key)
 
 
 def test_without_any_number_nothing_is_changed_and_it_says_so(cartpole, key):
-    lost = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.array(jnp.nan))
+    lost = Spoiled(cartpole.scene, frame_skip=2, lost=jnp.array(jnp.nan, float))  # of one type with zeros: one program
     start = eqx.filter_jit(ActorCritic(lost, SMALL, 1).init)(key)
     run = learning.learn(lost, key, num_updates=1, log_every=1, settings=SMALL)
     assert run.history["skipped"][0] == 1
