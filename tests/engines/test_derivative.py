@@ -103,10 +103,17 @@ def pushed():
     return at, end
 
 
-def test_every_argument_has_its_derivative(pushed):
+@pytest.fixture(scope="module")
+def programs(pushed):
+    """What becomes of the box, and its gradient by all at once, compiled."""
+    _, end = pushed
+    return jax.jit(end), jax.jit(jax.grad(end))
+
+
+def test_every_argument_has_its_derivative(pushed, programs):
     """Against central differences of the rollout, by a random direction in each."""
-    at, end = pushed
-    gradient, value, rng = jax.jit(jax.grad(end))(at), jax.jit(end), np.random.default_rng(3)
+    (at, _), (value, slopes), rng = pushed, programs, np.random.default_rng(3)
+    gradient = slopes(at)
     for name, there in at.items():
         direction = rng.normal(size=there.shape) * (np.abs(there) + 0.01 * (name in ("qvel", "ctrl", "force")))
         ends = [value(at | {name: there + sign * 1e-5 * direction}) for sign in (1, -1)]
@@ -115,9 +122,9 @@ def test_every_argument_has_its_derivative(pushed):
         np.testing.assert_allclose(jnp.sum(gradient[name] * direction), expected, rtol=1e-4, atol=1e-5, err_msg=name)
 
 
-def test_both_engines_and_both_modes_agree(pushed):
+def test_both_engines_and_both_modes_agree(pushed, programs):
     at, end = pushed
-    ours, theirs = (jax.jit(jax.grad(lambda a, e=engine: end(a, e)))(at) for engine in ("mjx", "mujoco"))
+    ours, theirs = jax.jit(jax.grad(lambda at: end(at, "mjx")))(at), programs[1](at)
     forward = jax.jit(jax.jacfwd(lambda v: end(at | {"qvel": v})))(at["qvel"])
     np.testing.assert_allclose(forward, theirs["qvel"], rtol=1e-10)
     for name in at:
@@ -131,7 +138,8 @@ def test_batches_are_those_of_single_calls(pushed):
     speeds, stiffness = at["qvel"] * jnp.array([[1.0], [0.5]]), jnp.array([400.0, 900.0, 2500.0])
     both = jax.value_and_grad(lambda v, k: end(at | {"qvel": v, "stiffness": k}), argnums=(0, 1))
     found = jax.jit(jax.vmap(jax.vmap(both, (None, 0)), (0, None)))(speeds, stiffness)
-    single = [both(v, k) for v in speeds for k in stiffness]
+    alone = jax.jit(both)
+    single = [alone(v, k) for v in speeds for k in stiffness]
     expected = jax.tree.map(lambda *x: np.reshape(x, (2, 3, *x[0].shape)), *single)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12), found, expected)
 
@@ -171,11 +179,11 @@ def test_second_derivatives_are_refused_by_name(pushed):
         jax.hessian(lambda k: end(at | {"stiffness": k}))(at["stiffness"])
 
 
-def test_a_model_that_is_differentiated_is_left_as_it_was(pushed):
-    at, end = pushed
-    before = end(at)
-    jax.grad(end)(at)
-    assert end(at) == before
+def test_a_model_that_is_differentiated_is_left_as_it_was(pushed, programs):
+    (at, _), (value, slopes) = pushed, programs
+    before = value(at)
+    slopes(at)
+    assert value(at) == before
 
 
 @pytest.mark.parametrize(("gradient", "geom"), [("discrete", "box"), ("slope", "sphere")])

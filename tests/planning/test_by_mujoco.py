@@ -85,6 +85,7 @@ def _counted(counts, name):
     return call
 
 
+@pytest.mark.parametrize("error", ["double", pytest.param("single", marks=pytest.mark.slow)], indirect=True)
 def test_a_plan_is_that_of_single_steps(error, system, monkeypatch):
     start, ours = np.asarray(start_of(system)), controller_of(system)
     by_steps(monkeypatch)
@@ -113,9 +114,9 @@ def test_a_law_turns_a_free_body_as_single_steps_do(error, system, monkeypatch):
         return problem.run(Exact(), course, law, step)
 
     given = (jnp.array([0.5, 0.0], dtype), jnp.array([1.0, jnp.nan], dtype))
-    found = jax.vmap(run)(*given)
+    found = jax.jit(jax.vmap(run))(*given)
     by_steps(monkeypatch)
-    expected = jax.vmap(run)(*given)
+    expected = jax.jit(jax.vmap(run))(*given)
     np.testing.assert_allclose(found.states, expected.states, atol=10 * error)
     np.testing.assert_allclose(found.controls, expected.controls, atol=10 * error)
     np.testing.assert_array_equal(found.controls[1], np.clip(controls, -limits, limits))
