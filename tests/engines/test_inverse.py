@@ -91,7 +91,7 @@ def test_a_control_at_its_limit_has_the_derivative_of_its_inside():
         <motor joint="j" ctrlrange="-1 1"/><motor joint="j" ctrlrange="-1 1"/><motor joint="j" ctrlrange="-1 1"/></actuator>
         </mujoco>"""
     )
-    engine, before = Pool(model), {"time": [[[0.0]]], "qpos": [[[0.0]]], "qvel": [[[0.0]]]}
+    engine, before = Pool(model), {name: np.zeros((1, 1, 1)) for name in ("time", "qpos", "qvel")}
     found = engine.maps(
         {},
         before,
