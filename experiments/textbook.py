@@ -16,10 +16,10 @@ from pydantic import Field, model_validator
 from scipy import stats
 
 from experiments import theme
+from experiments.optimisation.estimators import estimator
 from experiments.optimisation.settings import MethodSettings
 from experiments.problems import textbook
 from experiments.problems.comparison import Comparison, compare
-from experiments.problems.estimators import estimator
 from experiments.problems.textbook import Textbook
 from experiments.report import Table
 from experiments.settings import Finite, Positive, RunSettings

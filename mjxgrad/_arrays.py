@@ -81,6 +81,15 @@ def function(name: str, value: Any, *arguments: str) -> None:
         return
 
 
+def takes(function: Any, name: str) -> bool:
+    """Return whether a function has an argument of this name, one that is not bound yet."""
+    try:
+        found = inspect.signature(function).parameters.get(name)
+    except (TypeError, ValueError):  # a function of C without a signature
+        return False
+    return found is not None
+
+
 def form(value: Any) -> str:
     """Return the shape of numbers, or the type of anything else, for messages."""
     return f"shape {jnp.shape(value)}" if eqx.is_array_like(value) else type(value).__name__

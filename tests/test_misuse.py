@@ -221,7 +221,7 @@ FOUND = {
     "noisy.sample_noise(key)": "dim is not known: pass dim",
     "mg.open_loop(mg.SceneTask(scene, state, len, 4), jnp.ones(3))": "stddev must broadcast to (horizon, nu) = (4, 1), got (3,)",
     "mg.open_loop(mg.SceneTask(balls, still, len, 4), 0.1)": "action noise needs controls, got a task of (horizon, nu) = (4, 0)",
-    "rules.Consistent(failure_probability=0.95)": "failure_probability must be above 0 and at most 0.2, got 0.95",
+    "rules.TrustRegion(failure_probability=0.95)": "failure_probability must be above 0 and at most 0.2, got 0.95",
     "rules.BiasConstrained(1.0, bound=1.0, failure_probability=1.0)": "failure_probability must be above 0 and at most 1.0",
     "mg.linear_policy(3, 1)[0](mg.linear_policy(3, 1)[1], jnp.zeros(2))": "must observe 3 numbers, got shape (2,)",
     "mg.linear_policy(3, 1)[0](mg.linear_policy(3, 1)[1], {'x': 0})": "state must be a vector or a State, got dict",

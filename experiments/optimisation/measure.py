@@ -16,10 +16,10 @@ import mjxgrad as mg
 from experiments.config import ExperimentError
 from experiments.motion import own_task
 from experiments.optimisation import searches
+from experiments.optimisation.estimators import estimator
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
 from experiments.problems.comparison import affordable, bias_interval
-from experiments.problems.estimators import estimator
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import mean_interval

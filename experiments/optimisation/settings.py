@@ -18,14 +18,14 @@ class MethodSettings(SettingsTable):
 
     name: Literal[
         "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "reinforce",
-        "cross_entropy", "mppi", "predictive_sampling",
+        "per_step_inverse_variance", "cross_entropy", "mppi", "predictive_sampling",
     ]  # fmt: skip
     """Of a function in `mjxgrad.estimators` or in `searches.py`."""
     baseline: Literal["leave_one_out", "zero_noise", "none"] | None = None
     """Of zeroth order and REINFORCE; their own default if it is not set."""
     antithetic: bool | None = None
     """Whether zeroth order uses noise in pairs."""
-    rule: Literal["consistent", "inverse_variance", "concavity", "bias_constrained"] | None = None
+    rule: Literal["least_risk", "inverse_variance", "concavity", "trust_region", "bias_constrained"] | None = None
     """How alpha_order chooses its weight; bias_constrained takes the published constants of the task."""
     control_variate: bool | None = None
     """Whether the unbiased part of alpha_order uses derivatives."""
@@ -69,9 +69,9 @@ class MethodSettings(SettingsTable):
         parts += ["pairs"] if self.antithetic else []
         if self.control_variate is not None:
             # A rule of the literature mixes with plain zeroth order; said where it is not so.
-            is_usual = self.control_variate == (self.rule in (None, "consistent"))
+            is_usual = self.control_variate == (self.rule in (None, "least_risk"))
             parts += [] if is_usual else ["with control variate" if self.control_variate else "no control variate"]
-        elif self.rule not in (None, "consistent"):
+        elif self.rule not in (None, "least_risk"):
             parts.append("with control variate")
         parts += [f"width {self.stddev:g}"] if self.stddev else []
         name = _NAMES.get(self.name, self.name.replace("_", " "))

@@ -16,7 +16,7 @@ from experiments.policy_gradient.settings import Settings
 from experiments.problems.push import push
 from experiments.workspace import Workspace
 from mjxgrad.estimators.mixture import both_parts, weigh
-from mjxgrad.estimators.rules import Consistent
+from mjxgrad.estimators.rules import LeastRisk
 from mjxgrad.estimators.samples import plan_by_noise, stream
 
 DISCRETE, ONSET = GRADIENTS = ("discrete", "onset")
@@ -242,7 +242,7 @@ def estimated(objective: mg.Objective, params: Float[Array, " dim"], key: PRNGKe
     objective = objective.sized_for(params)
     plan = plan_by_noise(objective, num_samples, None)
     parts = stream(objective, params, key, plan, functools.partial(both_parts, control_variate=True))
-    weights = weigh(Consistent(), parts, plan)
+    weights = weigh(LeastRisk(), parts, plan)
     reason = jnp.asarray(weights.reason._value)  # pyright: ignore[reportAttributeAccessIssue]
     return Estimated(parts.first.mean, parts.unbiased.mean, weights.alpha, reason, parts.costs.mean)
 

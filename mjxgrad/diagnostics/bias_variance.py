@@ -34,7 +34,7 @@ from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.moments import Moments
-from mjxgrad.estimators.rules import Consistent
+from mjxgrad.estimators.rules import LeastRisk
 from mjxgrad.estimators.samples import DEFAULT_CHUNK_SIZE, Plan, Samples, sample
 from mjxgrad.objective import Differentiated, Objective, ParameterNoise
 from mjxgrad.objective.base import unchanged
@@ -457,7 +457,7 @@ def _in_batches(
 
     def one(batch: Samples) -> tuple[Array, Array, Array]:
         parts = both_parts(batch, control_variate=True)
-        alpha = weigh(Consistent(), parts, plan).alpha
+        alpha = weigh(LeastRisk(), parts, plan).alpha
         value, _ = parts.mixture(jnp.broadcast_to(alpha, parts.first.offset.shape))
         return jnp.where(parts.unbiased.count > 1, value, jnp.nan), alpha, parts.unbiased.count > 1
 

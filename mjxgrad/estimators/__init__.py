@@ -3,7 +3,9 @@
 from mjxgrad.estimators import rules
 from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate, Reason
 from mjxgrad.estimators.first_and_zeroth import first_and_zeroth_order, first_order, zeroth_order
+from mjxgrad.estimators.least_squares import least_squares
 from mjxgrad.estimators.mixture import alpha_order, control_variate
+from mjxgrad.estimators.per_step import per_step_inverse_variance, reinforce
 
 __all__ = [
     "Diagnosis",
@@ -13,6 +15,9 @@ __all__ = [
     "control_variate",
     "first_and_zeroth_order",
     "first_order",
+    "least_squares",
+    "per_step_inverse_variance",
+    "reinforce",
     "rules",
     "zeroth_order",
 ]

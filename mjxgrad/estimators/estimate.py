@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from mjxgrad._arrays import is_known
 from mjxgrad._text import Printed, format_number
+from mjxgrad.estimators.evidence import Memory
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan
 from mjxgrad.objective.base import Scalar, Vector
@@ -32,8 +33,9 @@ class Reason(eqx.Enumeration):
 
     fixed = "the estimator leaves no choice, or α was given"
     inverse_variance = "the weights are those of least variance: no bias was found, or none was looked for"
-    bias_limit = "α is as large as the bound on the bias allows, and smaller than the variances ask for"
+    bias_limit = "the first-order part is biased, so α is smaller than the variances ask for"
     uncertain = "the zeroth-order part is too noisy to bound the bias, so it stands alone"
+    inside = "the first-order part lies within the error of the zeroth-order part"
     inconsistent = "values and derivatives of the samples contradict each other, so the zeroth-order part stands alone"
     not_finite = "too few derivatives were finite, so the zeroth-order part stands alone"
     nothing_felt = (
@@ -63,6 +65,7 @@ class GradientEstimate(eqx.Module, Printed):
         reason: an item of `Reason`; every estimator may give `Reason.nothing_felt`.
         bias_bound: an upper bound on the norm of the bias of `value`, if the rule that chose `alpha` knows one. Zero for
             an unbiased estimate, NaN where nothing is known.
+        memory: what the next estimate of a descent can learn from this one; None where an estimator learns nothing.
     """
 
     value: PyTree[Float[Array, "..."]]
@@ -78,6 +81,7 @@ class GradientEstimate(eqx.Module, Printed):
     alpha: Scalar
     reason: Reason
     bias_bound: Scalar
+    memory: Memory | None = None
 
     def __str__(self) -> str:
         if not is_known(self.num_samples) or jnp.ndim(self.num_samples):
@@ -131,6 +135,7 @@ def assemble(
     alpha: ArrayLike = 0.0,
     reason: Any = Reason.fixed,
     bias_bound: ArrayLike = 0.0,
+    memory: Memory | None = None,
 ) -> GradientEstimate:
     """Assemble an estimate; its value is NaN where too few units were finite.
 
@@ -160,4 +165,5 @@ def assemble(
         alpha=alpha,
         reason=jax.tree.map(lambda x, y: jnp.where(is_nothing, x, y), Reason.nothing_felt, reason),
         bias_bound=jnp.asarray(bias_bound, value.dtype),
+        memory=memory,
     )

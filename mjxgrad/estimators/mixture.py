@@ -5,13 +5,14 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
+from mjxgrad.estimators.evidence import Evidence, Memory
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.estimators.rules import Consistent, Evidence, FixedAlpha, Rule, Weights
-from mjxgrad.estimators.samples import Group, Plan, Samples, plan_by_noise, stream
-from mjxgrad.estimators.unbiased import SecantSums, UnbiasedTerms, gram, secant_sums, unbiased_terms
+from mjxgrad.estimators.rules import FixedAlpha, LeastRisk, Rule, Weights
+from mjxgrad.estimators.samples import Group, Plan, Samples, in_groups, plan_by_noise, stream
+from mjxgrad.estimators.unbiased import Products, SecantSums, UnbiasedTerms, gram, secant_sums, unbiased_terms
 from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Scalar, Vector
 
@@ -24,6 +25,7 @@ def alpha_order(
     num_samples: int,
     rule: Rule | None = None,
     control_variate: bool = True,
+    memory: Memory | None = None,
     chunk_size: int | None = None,
 ) -> GradientEstimate:
     r"""Mix a first-order and an unbiased estimate of the gradient of a smoothed objective.
@@ -35,8 +37,9 @@ def alpha_order(
     The other arguments, and the units, are those of `first_order`.
 
     - `num_samples`: rollouts to spend. At least 2; with random starts even and at least 4, since pairs share a start.
-    - `rule`: the rule that chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `Consistent()`.
+    - `rule`: the rule that chooses $\alpha$; see `mjxgrad.estimators.rules`. None is `LeastRisk()`.
     - `control_variate`: whether $g^0$ uses derivatives; otherwise it is zeroth order with the leave-one-out baseline.
+    - `memory`: the `memory` of the estimate before in a descent, for evidence of all its steps; `optimise` sees to it.
     - `chunk_size`: rollouts at a time, at least 4; memory grows with it. Samples are compared, and leave each other out,
       within groups of at most 64 of a chunk.
 
@@ -49,7 +52,12 @@ def alpha_order(
     objective, vector, restore = as_vector(objective, params)
     plan = plan_by_noise(objective, num_samples, chunk_size)
     parts = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
-    weights = weigh(rule or Consistent(), parts, plan)
+    evidence = parts.evidence()
+    known = Memory.of(parts.difference.mean, evidence)
+    if memory is not None:
+        known = memory.with_more(known)
+        evidence = evidence.with_memory(known)
+    weights = weigh(rule or LeastRisk(), parts, plan, evidence)
     value, squared_error = parts.mixture(weights.alpha)
     return assemble(
         value,
@@ -62,6 +70,7 @@ def alpha_order(
         alpha=weights.alpha,
         reason=weights.reason,
         bias_bound=weights.bias_bound,
+        memory=known,
     )
 
 
@@ -90,26 +99,45 @@ class Parts(eqx.Module):
     costs: Moments
     scaled: Moments  # derivatives by the noise, in its standard deviations
     secants: SecantSums
-    linear_variance: Scalar  # variance of the costs that the mean derivative explains, summed over samples
+    differences: Products  # unbiased terms minus derivatives, by pairs of units
+    scores: Products
+    score_variance: Scalar  # squared norms of the scores, summed over samples
     beta: Scalar  # sum of the shares of the linear part that were taken off
     num_costs: Scalar  # number of samples in the last two sums
     num_groups: Scalar  # number of groups of samples that share their baselines
     num_felt: Int[Array, ""]  # see `Samples`
 
     def evidence(self) -> Evidence:
-        """Return the evidence for a rule, with all coordinates as one block."""
+        """Return the evidence for a rule."""
         missed = self.secants.missed / self.secants.pairs  # NaN without pairs
-        explained = self.linear_variance / jnp.maximum(self.num_costs, 1)
-        bound = jnp.sqrt(missed / jnp.where(explained > 0, explained, jnp.nan))
-        return Evidence.of(
-            self.first,
-            self.unbiased,
-            self.difference,
-            inconsistency=self.secants.inconsistency(),
-            relative_bias_bound=jnp.where(missed == 0, 0, bound),
+        spread = self.score_variance / jnp.maximum(self.num_costs, 1)
+        width = self.scores.mean / jnp.where(spread > 0, spread, 1)
+        count = as_real(self.first.count, self.first.offset)
+        first, zeroth, noise = (x.variance().sum() for x in (self.first, self.unbiased, self.difference))
+        unshared = [
+            jnp.clip(noise + x - y, 0, 2 * noise) / (2 * jnp.maximum(count, 1))
+            for x, y in ((zeroth, first), (first, zeroth))
+        ]
+        # The mean product of two samples' differences, and its variance where they have no mean (Chen, Qin 2010).
+        excess = (self.difference.mean**2).sum() - noise / jnp.maximum(count, 1)
+        error = jnp.sqrt(2 * self.differences.mean / jnp.maximum(count * (count - 1), 1))
+        return Evidence(
+            count=count,
+            dim=jnp.asarray(self.first.offset.size, count.dtype),
+            first_norm=jnp.linalg.norm(self.first.mean),
+            difference_norm=jnp.linalg.norm(self.difference.mean),
+            first_variance=first,
+            zeroth_variance=zeroth,
+            difference_variance=noise,
             cost_variance=self.costs.variance(),
             scaled_first_variance=self.scaled.variance().sum(),
             scaled_first_norm=jnp.linalg.norm(self.scaled.mean),
+            squared_bias=excess,
+            squared_bias_error=error,
+            squared_bias_bound=jnp.where(self.secants.pairs > 0, missed * width, jnp.inf),
+            zeroth_noise=unshared[0],
+            first_noise=unshared[1],
+            num_estimates=jnp.ones_like(count),
         )
 
     def mixture(self, alpha: Float[Array, "..."]) -> tuple[Vector, Vector]:
@@ -152,8 +180,14 @@ def both_parts(samples: Samples, *, control_variate: bool) -> Parts:
     num_costs = groups.has_cost.sum(axis=1)
     has_cost = chunk.complete((groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count])
     has_both = has_cost & chunk.complete(chunk.has_derivative)
-    unbiased, first = (chunk.by_unit(chunk.pull_back(samples, x)) for x in (terms_by_noise, chunk.derivatives))
-    real_counts = as_real(num_costs, chunk.costs)
+    pulled = [chunk.pull_back(samples, x) for x in (terms_by_noise, chunk.derivatives, chunk.scores)]
+    unbiased, first = (chunk.by_unit(x) for x in pulled[:2])
+
+    def products(rows: Float[Array, "rows dim"], mask: Bool[Array, " rows"], per_group: int) -> Products:
+        rows, mask = (in_groups(x, len(num_costs), per_group) for x in (rows, mask))
+        return jax.tree.map(lambda sums: sums.sum(axis=0), jax.vmap(Products.of)(rows, mask))
+
+    size, real_counts = groups.costs.shape[1], as_real(num_costs, chunk.costs)
     return Parts(
         first=Moments.of(first, has_both),
         unbiased=Moments.of(unbiased, has_cost),
@@ -161,7 +195,9 @@ def both_parts(samples: Samples, *, control_variate: bool) -> Parts:
         costs=Moments.of(chunk.by_unit(chunk.costs) + chunk.centre, has_cost),
         scaled=Moments.of(chunk.derivatives * chunk.stddev, chunk.has_derivative),
         secants=jax.tree.map(lambda sums: sums.sum(axis=0), secants),
-        linear_variance=(real_counts * terms.linear_variance).sum(),
+        differences=products(unbiased - first, has_both, size // chunk.per_unit),
+        scores=products(pulled[2], chunk.has_cost, size),
+        score_variance=(pulled[2] ** 2).sum(),
         beta=(groups.has_cost * terms.beta).sum(),
         num_costs=real_counts.sum(),
         num_groups=as_real((num_costs >= 2).sum(), chunk.costs),
@@ -169,12 +205,11 @@ def both_parts(samples: Samples, *, control_variate: bool) -> Parts:
     )
 
 
-def weigh(rule: Rule, parts: Parts, plan: Plan) -> Weights:
-    """Apply a rule; α is zero without finite derivatives, or if nothing was felt."""
+def weigh(rule: Rule, parts: Parts, plan: Plan, evidence: Evidence | None = None) -> Weights:
+    """Apply a rule, to the parts' evidence if no other is given; α is zero without finite derivatives, or if nothing was felt."""
     if isinstance(rule, type) or not callable(rule):
-        raise ValueError(f"rule must be one of mg.estimators.rules, such as rules.Consistent(), got {rule!r}")
-    evidence = parts.evidence()
-    weights, has_first = rule(evidence), evidence.count >= 2
+        raise ValueError(f"rule must be one of mg.estimators.rules, such as rules.LeastRisk(), got {rule!r}")
+    weights, has_first = rule(parts.evidence() if evidence is None else evidence), parts.first.count >= 2
     alpha = jnp.where(has_first & ~is_nothing_felt(plan, parts.costs, parts.num_felt), weights.alpha, 0)
     reason = Reason.where(has_first, weights.reason, Reason.not_finite)
     return Weights(alpha, reason, jnp.where(alpha > 0, weights.bias_bound, 0))

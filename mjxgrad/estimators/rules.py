@@ -1,7 +1,6 @@
 r"""Rules that weigh a first-order estimate against an unbiased one: $\alpha g^1 + (1 - \alpha) g^0$.
 
-A rule is any function from `Evidence` to `Weights`; `mg.learning` maps it over steps and actions. $\delta$ is everywhere
-the probability of *failure*.
+A rule is any function from `Evidence` to `Weights`. $\delta$ is everywhere the probability of *failure*.
 """
 
 from collections.abc import Callable
@@ -10,65 +9,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 from scipy import stats
 
-from mjxgrad._arrays import is_known
+from mjxgrad._arrays import is_known, real
 from mjxgrad.estimators.estimate import Reason
-from mjxgrad.estimators.moments import Moments
-from mjxgrad.objective.base import Scalar
-
-
-class Evidence(eqx.Module):
-    """The input of a rule: norms and variances of one block of coordinates, and facts about all coordinates.
-
-    Attributes:
-        count: number of samples behind the means, or of pairs where starts are random.
-        dim: number of coordinates in the block.
-        first_norm: norm of the mean derivative.
-        difference_norm: norm of the difference between the two means.
-        first_variance: trace of the covariance of one sample's derivative.
-        zeroth_variance: trace of the covariance of one sample's unbiased term.
-        difference_variance: trace of the covariance of one sample's difference; both parts share their rollouts.
-        inconsistency: share of the squared secants of the cost that derivatives do not explain, from zero.
-        relative_bias_bound: bound on the bias of the first order relative to its norm (see `SecantSums`): the standard
-            deviation of the cost that derivatives miss, over that of the cost that their mean explains.
-        cost_variance: variance of the cost.
-        scaled_first_variance: trace of the covariance of derivatives by the noise in its standard deviations.
-        scaled_first_norm: norm of the mean of these derivatives.
-    """
-
-    count: Int[Array, "*blocks"]
-    dim: Float[Array, "*blocks"]
-    first_norm: Float[Array, "*blocks"]
-    difference_norm: Float[Array, "*blocks"]
-    first_variance: Float[Array, "*blocks"]
-    zeroth_variance: Float[Array, "*blocks"]
-    difference_variance: Float[Array, "*blocks"]
-    inconsistency: Float[Array, "*blocks"]
-    relative_bias_bound: Float[Array, "*blocks"]
-    cost_variance: Float[Array, "*blocks"]
-    scaled_first_variance: Float[Array, "*blocks"]
-    scaled_first_norm: Float[Array, "*blocks"]
-
-    @classmethod
-    def of(cls, first: Moments, zeroth: Moments, difference: Moments, **facts: Float[Array, ""]) -> "Evidence":
-        """Return the evidence of one block: moments of both parts and of their difference, and facts, NaN if not given."""
-        parts = {"first": first, "zeroth": zeroth, "difference": difference}
-        known = {f"{name}_variance": part.variance().sum() for name, part in parts.items()}
-        known |= {f"{name}_norm": jnp.linalg.norm(parts[name].mean) for name in ("first", "difference")}
-        unknown = dict.fromkeys(cls.__annotations__, jnp.full_like(known["first_norm"], jnp.nan))
-        dim = jnp.ones_like(first.offset).sum()
-        return cls(**{**unknown, **known, **facts, "count": first.count, "dim": dim})
-
-    @property
-    def real_count(self) -> Float[Array, "*blocks"]:
-        return self.count.astype(self.first_norm.dtype)
-
-    def least_variance(self, excess: Float[Array, "*blocks"] | float = 0.0) -> Float[Array, "*blocks"]:
-        """Return the weight V⁰/(V⁰ + V¹ + excess) of the first order; 1 where all are zero."""
-        total = self.zeroth_variance + (self.first_variance + excess)
-        return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
+from mjxgrad.estimators.evidence import Evidence
 
 
 class Weights(eqx.Module):
@@ -80,9 +26,9 @@ class Weights(eqx.Module):
         bias_bound: upper bound on the norm of the bias, NaN where the rule knows none.
     """
 
-    alpha: Float[Array, "*blocks"]
+    alpha: Float[Array, "*batch"]
     reason: Reason
-    bias_bound: Float[Array, "*blocks"]
+    bias_bound: Float[Array, "*batch"]
 
 
 Rule = Callable[[Evidence], Weights]
@@ -101,6 +47,14 @@ class FixedAlpha(eqx.Module):
     def __call__(self, evidence: Evidence) -> Weights:
         alpha = jnp.asarray(self.alpha, evidence.first_norm.dtype)
         return Weights(alpha, Reason.fixed, jnp.where(alpha > 0, jnp.nan, 0))
+
+
+class InverseVariance(eqx.Module):
+    r"""$\alpha = V^0/(V^0 + V^1)$: least variance if both parts are independent, blind to bias."""
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        alpha = evidence.least_variance()
+        return Weights(alpha, Reason.inverse_variance, jnp.where(alpha > 0, jnp.nan, 0))
 
 
 class BiasConstrained(eqx.Module):
@@ -139,45 +93,106 @@ class BiasConstrained(eqx.Module):
 
     def zeroth_error(self, evidence: Evidence) -> Float[Array, ""]:
         """Return ε; the error of the unbiased part exceeds it with probability δ at most."""
-        rate = jnp.log((evidence.dim + 1) / self.failure_probability) / evidence.real_count
+        rate = jnp.log((evidence.dim + 1) / self.failure_probability) / evidence.count
         return jnp.sqrt(2 * evidence.zeroth_variance * rate) + 2 / 3 * jnp.asarray(self.bound) * rate
 
 
-class Consistent(eqx.Module):
-    r"""First order where the derivatives explain the costs, weighed by least error; the default.
+class TrustRegion(eqx.Module):
+    r"""First order as far as it lies within the error of zeroth order, by the empirical bias alone.
 
-    The rule asks two questions, the sharper one first:
-
-    - Do the derivatives of the samples explain the differences of their costs (see `SecantSums`)? If a share of more
-      than `threshold` remains unexplained, $\alpha = 0$. This finds jumps with few samples and in many dimensions.
-    - Does the difference of both parts exceed its own noise, $\|g^1 - g^0\| > \varepsilon$ with failure probability
-      $\delta$? The excess $\|g^1 - g^0\|^2 - \varepsilon^2$ is added to the variance of the first order:
-      $\alpha = V^0/(V^0 + V^1 + n\,\text{excess})$, the weight of least mean squared error.
+    The estimate is the point nearest to $g^1$ in a ball about $g^0$: $\alpha = \min(1, r/\|g^1 - g^0\|)$. The truth lies in
+    the ball with the probability $1 - \delta$, so that the error is at most twice the radius $r$, however wrong derivatives
+    are. Unlike `BiasConstrained` it has no constants of the task.
 
     Attributes:
-        threshold: share of the squared secants that may remain unexplained. The bias is then at most the root of this
-            share times $\mathrm{sd}(f)/\sigma$.
         failure_probability: $\delta$, at most 0.2.
 
     References:
-        Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators.
-        Journal of the American Statistical Association 86, 1991 (weights from the squared difference).
+        Tedrake. Do Differentiable Simulators Give Better Policy Gradients? Talk at the RSS workshop on differentiable
+        simulation, 2022 (the empirical bias as a trust region).
     """
 
-    threshold: float = eqx.field(static=True, default=0.1)
     failure_probability: float = eqx.field(static=True, default=0.05)
 
     def __check_init__(self):
         _check_failure_probability(self.failure_probability, _MOST_FAILURES)
 
     def __call__(self, evidence: Evidence) -> Weights:
-        error = confidence_radius(evidence.difference_variance, evidence.count, self.failure_probability)
-        excess = jnp.maximum(evidence.difference_norm**2 - error**2, 0)
-        is_consistent = evidence.inconsistency <= self.threshold
-        alpha = jnp.where(is_consistent, evidence.least_variance(evidence.real_count * excess), 0)
-        reason = Reason.where(excess > 0, Reason.bias_limit, Reason.inverse_variance)
-        reason = Reason.where(is_consistent, reason, Reason.inconsistent)
-        return Weights(alpha, reason, alpha * evidence.relative_bias_bound * evidence.first_norm)
+        radius = confidence_radius(evidence.zeroth_variance, evidence.count, self.failure_probability)
+        found = evidence.difference_norm
+        is_inside = found <= radius
+        alpha = jnp.where(is_inside, 1, radius / jnp.where(is_inside, 1, found))
+        reason = Reason.where(is_inside, Reason.inside, Reason.bias_limit)
+        return Weights(alpha, reason, radius + alpha * found)
+
+
+class Concavity(eqx.Module):
+    r"""Inverse variance if $V^1 \ge 2(1 - c)\mathrm{Var}f/\sigma^2 - 2\|g^1\|^2$, else $\alpha = 0$ (DDCG).
+
+    A smooth cost satisfies this on average with $c = 0$, a Poincaré inequality one order higher. A cost with jumps has
+    too much variance for its derivatives.
+
+    Attributes:
+        slack: $c$.
+
+    References:
+        Onoda et al., arXiv:2604.18161 (DDCG), here with the noise of each coordinate in its own standard deviations.
+    """
+
+    slack: float = eqx.field(static=True, default=0.3)
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        needed = 2 * (1 - self.slack) * evidence.cost_variance - 2 * evidence.scaled_first_norm**2
+        is_smooth = evidence.scaled_first_variance >= needed
+        alpha = jnp.where(is_smooth, evidence.least_variance(), 0)
+        reason = Reason.where(is_smooth, Reason.inverse_variance, Reason.inconsistent)
+        return Weights(alpha, reason, jnp.where(alpha > 0, jnp.nan, 0))
+
+
+class LeastRisk(eqx.Module):
+    r"""The weight of least mean squared error, for bias as far as it is seen; the default.
+
+    Let $V^1$ and $V^0$ be the noise of both means that they do not share, and $b$ the bias of the first order. The squared
+    error of the mixture, but for what both share, is $\alpha^2(V^1 + b^2) + (1 - \alpha)^2 V^0$. It is least at
+
+    $$\alpha = \frac{V^0}{V^0 + V^1 + b^2}.$$
+
+    Of two sources for $b^2$ the smaller counts:
+
+    - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it; one standard error is taken off. In many dimensions $D$ is
+      known to a small part of $V^0$, so that the mixture loses little to the better part whatever the bias.
+    - $U$, by what derivatives leave unexplained in the costs, bounds it from above (see `SecantSums`). It is zero for a
+      quadratic. Where samples are fewer than dimensions, it lies below $V^0$: no bias does more harm there than the noise of
+      zeroth order.
+
+    Derivatives that scatter about the right mean leave much unexplained, but then $D$ is near zero. Derivatives that miss a
+    jump show in both.
+
+    In a descent (see `Memory`) $D$ is that of the mean over its last steps, and $b^2$ counts as many times as there are steps
+    over which noise averages.
+
+    Attributes:
+        errors: standard errors that are taken off $D$. With 0, noise is taken for bias half of the time, and first order is
+            given up where it is exact; with 2, biases as large as the noise of zeroth order stay unseen.
+
+    References:
+        Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators. Journal of the
+        American Statistical Association 86, 1991 (weights from the squared difference). Chen, Qin. A two-sample test for
+        high-dimensional data with applications to gene-set testing. Annals of Statistics 38, 2010 (D and its noise).
+    """
+
+    errors: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        real("errors", self.errors)
+
+    def __call__(self, evidence: Evidence) -> Weights:
+        seen = evidence.squared_bias - self.errors * evidence.squared_bias_error
+        bias = jnp.clip(seen, 0, evidence.squared_bias_bound)
+        risk = evidence.zeroth_noise + (evidence.first_noise + evidence.num_estimates * bias)
+        alpha = jnp.where(risk > 0, evidence.zeroth_noise / jnp.where(risk > 0, risk, 1), 1)
+        reason = Reason.where(bias > 0, Reason.bias_limit, Reason.inverse_variance)
+        return Weights(alpha, reason, alpha * jnp.sqrt(evidence.squared_bias_bound))
 
 
 # Above this, a single coordinate is not the worst case among Gaussian quadratic forms.
@@ -185,7 +200,9 @@ _MOST_FAILURES = 0.2
 _LONGEST_TABLE = 1000
 
 
-def confidence_radius(variance: Scalar, count: Int[Array, ""], failure_probability: float) -> Scalar:
+def confidence_radius(
+    variance: Float[Array, "*batch"], count: Float[Array, "*batch"], failure_probability: float
+) -> Float[Array, "*batch"]:
     """Return a radius that the norm of a mean's error exceeds with at most the given probability.
 
     It is Student's quantile times the standard error of the whole vector. For a nearly normal mean it is safe for every
@@ -198,8 +215,8 @@ def confidence_radius(variance: Scalar, count: Int[Array, ""], failure_probabili
     # JAX has no quantile of Student's t, so it comes from a table; beyond the table it is constant to three digits.
     freedom = np.arange(1, _LONGEST_TABLE)
     quantiles = np.concatenate([[np.inf, np.inf], stats.t.isf(failure_probability / 2, freedom)])
-    quantile = jnp.asarray(quantiles, variance.dtype)[jnp.clip(count, 0, _LONGEST_TABLE)]
-    spread = jnp.sqrt(variance / jnp.maximum(count, 1).astype(variance.dtype))
+    quantile = jnp.asarray(quantiles, variance.dtype)[jnp.clip(jnp.round(count), 0, _LONGEST_TABLE).astype(int)]
+    spread = jnp.sqrt(variance / jnp.maximum(count, 1))
     return jnp.where(count >= 2, quantile * spread, jnp.inf)
 
 

@@ -242,13 +242,15 @@ class Group(eqx.Module):
         num_groups = -(-count // GROUP_SIZE)
         size = unit * -(-count // (num_groups * unit))
 
-        def split(leaf: Array) -> Array:
-            filled = jnp.pad(leaf, [(0, num_groups * size - count)] + [(0, 0)] * (leaf.ndim - 1))
-            return filled.reshape(num_groups, size, *leaf.shape[1:])
-
         own = ("costs", "derivatives", "scores", "has_cost", "has_derivative")
         each = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_groups, *leaf.shape)), self)
-        return dataclasses.replace(each, **{name: split(getattr(self, name)) for name in own})
+        return dataclasses.replace(each, **{name: in_groups(getattr(self, name), num_groups, size) for name in own})
+
+
+def in_groups(rows: Array, num_groups: int, size: int) -> Array:
+    """Return rows in groups of a size, on a first axis, padded by zeros."""
+    filled = jnp.pad(rows, [(0, num_groups * size - len(rows))] + [(0, 0)] * (rows.ndim - 1))
+    return filled.reshape(num_groups, size, *rows.shape[1:])
 
 
 def _by_parameters(objective: Objective, plan: Plan, params: Vector, noise: PyTree) -> Differentiated:

@@ -13,7 +13,7 @@ removes the linear part of the cost, the source of most of the noise of a zeroth
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjxgrad.estimators.samples import Group
 
@@ -27,7 +27,6 @@ class UnbiasedTerms(eqx.Module):
 
     by_noise: Float[Array, "samples m"]  # term of each sample before the pull-back
     beta: Float[Array, " samples"]  # share β of each sample
-    linear_variance: Float[Array, ""]  # variance of the linear part a·w over the samples
 
 
 def gram(samples: Group) -> _Pairs:
@@ -48,10 +47,7 @@ def unbiased_terms(samples: Group, slopes: _Pairs, *, with_derivatives: bool) ->
     num_others = jnp.maximum(others.sum(axis=1), 1)
     # (mean derivative without j) · w_k
     along = (slopes.sum(axis=0)[None, :] - slopes) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
-    if with_derivatives:
-        beta, linear_variance = _fitted_share(samples, slopes, others)
-    else:
-        beta, linear_variance = jnp.zeros_like(costs), jnp.zeros_like(num_slopes)
+    beta = _fitted_share(samples, slopes, others) if with_derivatives else jnp.zeros_like(costs)
     rest = costs[None, :] - beta[:, None] * along
     baseline = (others * rest).sum(axis=1) / num_others
     if samples.per_unit == 2:
@@ -60,10 +56,10 @@ def unbiased_terms(samples: Group, slopes: _Pairs, *, with_derivatives: bool) ->
     total = samples.derivatives.sum(axis=0)[None, :]
     without = (total - samples.derivatives) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
     by_noise = residual[:, None] * samples.scores + beta[:, None] * without
-    return UnbiasedTerms(by_noise, beta, linear_variance)
+    return UnbiasedTerms(by_noise, beta)
 
 
-def _fitted_share(samples: Group, slopes: _Pairs, others: _Pairs) -> tuple[Float[Array, " samples"], Float[Array, ""]]:
+def _fitted_share(samples: Group, slopes: _Pairs, others: _Pairs) -> Float[Array, " samples"]:
     """Regress the costs of the other samples on the linear part, both samples left out of the mean derivative.
 
     Up to fourth moments, the share that minimises the variance of the remaining costs minimises that of the estimate.
@@ -85,8 +81,7 @@ def _fitted_share(samples: Group, slopes: _Pairs, others: _Pairs) -> tuple[Float
     squares = (explaining**2).sum(axis=1)
     has_any = squares > 0
     share = (explaining * explained).sum(axis=1) / jnp.where(has_any, squares, 1)
-    variance = squares.sum() / jnp.maximum(pairs.sum(), 1)
-    return jnp.where(has_any, jnp.clip(share, 0, 1), 0), variance
+    return jnp.where(has_any, jnp.clip(share, 0, 1), 0)
 
 
 def _partner_prediction(samples: Group, rest: _Pairs, others: _Pairs) -> Float[Array, " samples"]:
@@ -111,7 +106,7 @@ def _partner(rows: _Pairs) -> _Pairs:
 
 
 class SecantSums(eqx.Module):
-    r"""Sums over pairs of samples, to be added over groups: whether derivatives explain the differences between costs.
+    r"""Sums over pairs of samples, to be added over groups: how much of the costs their derivatives miss.
 
     For two samples that differ only in their noise, the trapezoidal rule along the line between them gives
 
@@ -120,47 +115,47 @@ class SecantSums(eqx.Module):
     The residual is zero for every quadratic, and of third order in the distance where $f$ is smooth. A jump between the two
     samples is wholly in it: two samples on different sides of a jump are enough.
 
-    Residuals and differences are divided by the distance. Near pairs therefore count most, where smooth functions are flat
-    and jumps are not. In many dimensions all distances are alike.
-
-    The residual also bounds the bias. Let $J$ be the part of the cost that derivatives miss. The bias of the first-order
-    estimate is $-\mathbb{E}[J s]$. The components of $\sigma s$ are orthonormal, so its norm is at most
-    $\mathrm{sd}(J)/\sigma$ in any dimension (Bessel's inequality), and $\mathbb{E}[r^2] \approx 2\,\mathrm{Var}\,J$.
+    It bounds the bias. Let $J$ be the part of the cost that derivatives miss. The bias of the first-order estimate is
+    $-\mathbb{E}[J s]$, and $\mathbb{E}[r^2] \approx 2\,\mathrm{Var}\,J$. For noise of one standard deviation on the
+    parameters the components of $\sigma s$ are orthonormal, so that the norm is at most $\mathrm{sd}(J)/\sigma$ in any
+    dimension (Bessel's inequality). In general $\sigma^{-2}$ is the largest eigenvalue of the scores' covariance; their
+    mean eigenvalue, weighed by themselves, stands for it.
     """
 
-    residual: Float[Array, ""]  # squared residuals over squared distances, in standard deviations of the noise
-    difference: Float[Array, ""]  # squared differences of costs over the same squared distances
     missed: Float[Array, ""]  # half the squared residuals: over the pairs, the variance of what derivatives miss
     pairs: Float[Array, ""]  # number of pairs
-
-    def inconsistency(self) -> Float[Array, ""]:
-        """Return the share of the squared secants that derivatives do not explain; zero where they explain all."""
-        return jnp.where(self.residual > 0, self.residual / jnp.maximum(self.difference, self.residual * 1e-6), 0)
 
 
 def secant_sums(samples: Group, slopes: _Pairs) -> SecantSums:
     """Compare all pairs of a group that differ only in their noise; every pair is in the sums twice."""
     own = jnp.diagonal(slopes)
-    difference = samples.costs[:, None] - samples.costs[None, :]
     # The derivatives of both samples along the line from k to j.
     rise = (own[:, None] - slopes + slopes.T - own[None, :]) / 2
-    residual = difference - rise
+    residual = samples.costs[:, None] - samples.costs[None, :] - rise
     rounding = _ROUNDING * jnp.finfo(residual.dtype).eps * samples.rounding
-    scaled = samples.noise / samples.stddev
-    squares = (scaled**2).sum(axis=1)
-    distance = squares[:, None] + squares[None, :] - 2 * jnp.matmul(scaled, scaled.T, precision="highest")
     is_pair = samples.has_derivative[:, None] & samples.has_derivative[None, :] & ~jnp.eye(len(own), dtype=bool)
     if samples.per_unit == 2:  # other samples differ in their start, too
         unit = jnp.arange(len(own)) // 2
         is_pair &= unit[:, None] == unit[None, :]
-    # Coinciding samples have no secant; the floor is the rounding error of `distance`.
-    floor = 16 * jnp.finfo(distance.dtype).eps * jnp.maximum(squares.max(), 1e-30)
-    is_pair &= distance > floor
-    inverse = jnp.where(is_pair, 1 / jnp.where(is_pair, distance, 1), 0)
     residual = jnp.where(is_pair & (jnp.abs(residual) > rounding), residual, 0)
-    return SecantSums(
-        residual=(residual**2 * inverse).sum(),
-        difference=(difference**2 * inverse).sum(),
-        missed=(residual**2).sum() / 2,
-        pairs=is_pair.sum().astype(residual.dtype),
-    )
+    return SecantSums((residual**2).sum() / 2, is_pair.sum().astype(residual.dtype))
+
+
+class Products(eqx.Module):
+    """Sums of the squared products of two rows of a group, to be added over groups."""
+
+    squares: Float[Array, ""]
+    pairs: Float[Array, ""]
+
+    @classmethod
+    def of(cls, rows: Float[Array, "rows dim"], mask: Bool[Array, " rows"]) -> "Products":
+        rows = jnp.where(mask[:, None], rows, 0)
+        products = jnp.matmul(rows, rows.T, precision=jax.lax.Precision.HIGHEST)
+        count = mask.sum().astype(rows.dtype)
+        others = jnp.where(jnp.eye(len(rows), dtype=bool), 0, products)
+        return cls((others**2).sum(), count * (count - 1))
+
+    @property
+    def mean(self) -> Float[Array, ""]:
+        """The squared Frobenius norm of the rows' second moment, without bias; zero without pairs."""
+        return self.squares / jnp.maximum(self.pairs, 1)

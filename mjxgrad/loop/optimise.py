@@ -11,7 +11,7 @@ import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, instance, one_key
+from mjxgrad._arrays import function, instance, one_key, takes
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
@@ -59,7 +59,8 @@ def optimise(
             pytree of the same form, and the result has this form. Estimators see all its arrays as one vector.
         key: key of all noise; with a leading axis, one per seed.
         estimator: function called as `estimator(objective, params, key)`: your own, or one of `mg.estimators` with its
-            settings bound by `functools.partial`.
+            settings bound by `functools.partial`. One that takes `memory`, as `alpha_order` does, is given the `memory` of
+            the estimate before.
         optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.
         num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
@@ -102,12 +103,21 @@ class GradientStep(Descent):
             "optimiser", self.optimiser, optax.GradientTransformation, "of optax with its settings, as optax.adam(1e-2)"
         )
 
-    def init_state(self, params: Vector) -> PyTree:
-        return jax.tree.map(jnp.asarray, self.optimiser.init(params))
+    def init_state(self, params: Vector) -> tuple[PyTree, PyTree]:
+        """Return the optimiser's first state, and an empty memory for an estimator that takes one, else None."""
+        state = jax.tree.map(jnp.asarray, self.optimiser.init(params))
+        if not takes(self.estimator, "memory"):
+            return state, None
+        zero = jnp.zeros((), jnp.int32)
+        shapes = jax.eval_shape(
+            lambda at: self.estimated(self.objective, at, jax.random.key(0), zero)[1].memory, params
+        )
+        return state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
-        scale, estimate = self.estimated(self.objective, carry.params, carry.key, index)
-        change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
+        inner, memory = carry.state
+        scale, estimate = self.estimated(self.objective, carry.params, carry.key, index, memory)
+        change, inner, is_taken = self.change(carry.params, inner, estimate, estimate.value)
         dtype = carry.params.dtype
         record = Record(
             cost=estimate.objective_mean.astype(dtype),
@@ -122,17 +132,20 @@ class GradientStep(Descent):
             num_gradient_rollouts=estimate.num_gradient_rollouts.astype(jnp.int32),
             is_taken=is_taken,
         )
-        return self.moved(carry, index, carry.params + change, state, record)
+        return self.moved(
+            carry, index, carry.params + change, (inner, None if memory is None else estimate.memory), record
+        )
 
     def estimated(
-        self, objective: Any, params: Vector, key: PRNGKeyArray, step: Int[Array, ""]
+        self, objective: Any, params: Vector, key: PRNGKeyArray, step: Int[Array, ""], memory: PyTree = None
     ) -> tuple[Scalar, GradientEstimate]:
         """Return the scale of a step, 1 without annealing, and the estimate at this scale."""
         scale = jnp.ones((), params.dtype)
         if self.annealing is not None:
             scale = jnp.asarray(self.annealing(step), params.dtype)
             objective = objective(scale)
-        estimate = self.estimator(objective, params, jax.random.fold_in(key, step))
+        known = {} if memory is None else {"memory": memory}
+        estimate = self.estimator(objective, params, jax.random.fold_in(key, step), **known)
         if not isinstance(estimate, GradientEstimate):
             raise ValueError(f"estimator must return a GradientEstimate, got {type(estimate).__name__}")
         return scale, jax.tree.map(jnp.asarray, estimate)
@@ -168,7 +181,7 @@ class EstimatedGradientState(eqx.Module):
     num_skipped: Int[Array, ""]
     scale: Scalar
     estimate: GradientEstimate
-    inner: PyTree
+    inner: tuple[PyTree, PyTree]
 
 
 def estimated_gradient(
@@ -202,16 +215,18 @@ def estimated_gradient(
     one_key(key)
     rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
-    def estimated(params: PyTree, step: Int[Array, ""]) -> tuple[Scalar, GradientEstimate]:
+    def estimated(params: PyTree, step: Int[Array, ""], memory: PyTree = None) -> tuple[Scalar, GradientEstimate]:
         vector, restore = flattened(params)
-        return rule.estimated(of_vector(objective, restore), vector, key, step)
+        return rule.estimated(of_vector(objective, restore), vector, key, step, memory)
 
     def init(params: PyTree) -> EstimatedGradientState:
         zero = jnp.zeros((), jnp.int32)
+        vector, restore = flattened(params)
+        inner = dataclasses.replace(rule, objective=of_vector(objective, restore)).init_state(vector)
         shapes = jax.eval_shape(lambda step: estimated(params, step), zero)
         nothing = lambda x: jnp.full(x.shape, jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else 0, x.dtype)  # noqa: E731
         scale, estimate = jax.tree.map(nothing, shapes)
-        return EstimatedGradientState(zero, zero, scale, estimate, rule.init_state(flattened(params)[0]))
+        return EstimatedGradientState(zero, zero, scale, estimate, inner)
 
     def update(
         updates: PyTree, state: EstimatedGradientState, params: PyTree = None, **_: Any
@@ -219,10 +234,12 @@ def estimated_gradient(
         if params is None:
             raise ValueError("params must be given to update, got None: the gradient is estimated there")
         vector, restore = flattened(params)
-        scale, estimate = estimated(params, state.step)
+        inner, memory = state.inner
+        scale, estimate = estimated(params, state.step, memory)
         gradient = estimate.value if updates is None else estimate.value + flattened(updates)[0]
-        change, inner, is_taken = rule.change(vector, state.inner, estimate, gradient)
-        moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)
+        change, inner, is_taken = rule.change(vector, inner, estimate, gradient)
+        kept = (inner, None if memory is None else estimate.memory)
+        moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, kept)
         return change if restore is None else eqx.filter(restore(change), eqx.is_inexact_array), moved
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]

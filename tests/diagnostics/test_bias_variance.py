@@ -108,19 +108,22 @@ def test_the_bias_of_first_order_is_the_jump_that_it_misses(jumps):
     assert ((low[0] < 0) & (high[0] > 0)).sum() >= 2
 
 
-def test_alpha_order_misses_no_jump_and_is_no_worse_than_zeroth_order(jumps, ramps):
-    """Its bias is at most the root of what may stay unexplained times sd(f)/σ; here it is within its error at once."""
+def test_alpha_order_in_batches_is_nearly_as_good_as_the_better_part(jumps, ramps):
+    """By mean squared error of a batch of 16, from the bias and the variance of the table."""
     table, _, _ = jumps
-    np.testing.assert_array_less(table.table()["alpha"][2], 0.1)
-    mixed, column = table.alpha_order, table.table()
-    np.testing.assert_array_less(
-        np.abs(mixed.value - table.reference)[2], 4 * np.hypot(mixed.standard_error, table.reference_error)[2]
-    )
-    assert not column["alpha_order_is_biased"][2].any()
+    column = table.table()
+
+    def error(name: str, bias: np.ndarray) -> np.ndarray:
+        return bias[..., 0] ** 2 + column[f"{name}_variance"] / 16
+
+    exact = np.asarray(HEIGHTS)[:, None] * norm.pdf(np.asarray(POINTS)[:, 0] / STDDEV) / STDDEV
+    best = np.minimum(error("first", exact[..., None]), error("zeroth", np.zeros((*exact.shape, 1))))
+    mixed = error("alpha_order", np.asarray(table.alpha_order.value - table.reference))
+    # Two fifths are lost at most by the closed forms of test_alpha.py; a few batches know the error to a quarter.
+    np.testing.assert_array_less(mixed[1:], 1.75 * best[1:])
     # The variance of means of 16, per rollout; its interval holds it.
     assert (column["alpha_order_variance_low"] < column["alpha_order_variance"]).all()
     assert (column["alpha_order_variance"] < column["alpha_order_variance_high"]).all()
-    np.testing.assert_array_less(column["alpha_order_variance"][2], 1.5 * column["zeroth_variance"][2])
     # Of a ramp that is as wide as the noise derivatives tell all: there it is as good as first order.
     soft = ramps.table()
     np.testing.assert_array_less(soft["alpha_order_variance"][0], 0.5 * soft["zeroth_variance"][0])

@@ -1,5 +1,7 @@
 """The α-order estimate: what it mixes, where it trusts derivatives, and what it says about it."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -52,29 +54,106 @@ def test_the_error_bar_of_a_mixture_knows_that_its_parts_share_rollouts():
     assert_unbiased_with_right_errors(estimates, truth, num_samples=20)
 
 
-def test_a_quadratic_is_always_left_to_first_order():
-    """The trapezoidal rule is exact for it, whatever its curvature and however near its minimum."""
-    matrix = jnp.array([[30.0, 1.0, 0.0], [1.0, 0.01, 0.2], [0.0, 0.2, -4.0]])
-    objective = parameter_noise(lambda x: 1e4 + x @ matrix @ x, STDDEVS)
-    estimates = repeat(estimators.alpha_order, objective, jnp.zeros(3), 500, seed=0, num_samples=10)
-    assert not np.any(jax.tree.leaves(estimates.reason)[0] == jax.tree.leaves(Reason.inconsistent)[0])
-    assert np.all(np.asarray(estimates.alpha) > 0)
+def error_of(estimates, truth):
+    """Mean squared error, and its standard error."""
+    squares = ((np.asarray(estimates.value) - truth) ** 2).sum(axis=-1)
+    return squares.mean(), squares.std() / np.sqrt(len(squares))
 
 
-def test_a_jump_between_samples_is_always_seen():
-    """A step on a slope at ten samples: either all fall on one side, with chance 2/2^10 here, or the jump is seen."""
-    objective = parameter_noise(lambda x: 3 * x[0] + jnp.where(x[0] >= 0, 1.0, 0.0), 0.1, dim=1)
-    estimates = repeat(estimators.alpha_order, objective, jnp.zeros(1), 4000, seed=0, num_samples=10)
-    assert (estimates.alpha > 0).mean() < 0.01
+MATRIX = jnp.array([[30.0, 1.0, 0.0], [1.0, 0.01, 0.2], [0.0, 0.2, -4.0]])
+
+
+def scattered(x):
+    """Teeth of slope -1, twenty to a standard deviation, in 30 coordinates: the derivative knows the trend, but for 2 %."""
+    return (2 * x + 0.002 * jnp.sin(x / 0.001)).sum()
+
+
+def half_step(x):
+    return x[0] + jnp.where(x >= 0, 0.2, 0.0).sum()
+
+
+STEP = 1 / (np.sqrt(2 * np.pi) * 0.1)  # slope of a smoothed step of height 1 at its edge
+
+
+@pytest.mark.parametrize(
+    ("function", "dim", "truth", "num_samples", "most"),
+    [
+        # Derivatives are right: no more than the noise of α is lost.
+        pytest.param(lambda x: 1e4 + x @ MATRIX @ x, 3, 0.0, 10, 1.1, id="quadratic"),
+        pytest.param(lambda x: ((x - 1) ** 2).sum(), 100, -2.0, 16, 1.02, id="quadratic, many dimensions"),
+        # Their scatter is noise, not bias: V¹ = 2 per coordinate, V⁰ far more.
+        pytest.param(scattered, 30, 2.0, 16, 1.1, id="scatter"),
+        # They miss a jump, in one coordinate and in many, where the jump is large and where it is hidden in noise.
+        pytest.param(lambda x: 3 * x[0] + 2 * jnp.where(x[0] >= 0, 1.0, 0.0), 1, 3 + 2 * STEP, 16, 1.15, id="jump"),
+        pytest.param(lambda x: jnp.where(x >= 0, 1.0, 0.0).sum(), 40, STEP, 16, 1.0, id="jumps"),
+        pytest.param(lambda x: jnp.where(x >= 0, 1.0, 0.0).sum(), 40, STEP, 64, 0.8, id="jumps, more samples"),
+        pytest.param(lambda x: jnp.where(x[0] >= 0.2, 1.0, 0.0), 1, STEP * np.exp(-2), 16, 1.5, id="rare jump"),
+    ],
+)
+def test_alpha_order_is_as_good_as_the_better_part(function, dim, truth, num_samples, most):
+    """At each by mean squared error over batches, in units of the better of first and zeroth order."""
+    objective = parameter_noise(function, 0.1, dim=dim)
+    first, zeroth, mixed = (
+        error_of(repeat(f, objective, jnp.zeros(dim), 1000, seed=0, num_samples=num_samples), truth)
+        for f in (estimators.first_order, estimators.zeroth_order, estimators.alpha_order)
+    )
+    best = min(first, zeroth)
+    assert mixed[0] < most * best[0] + 3 * mixed[1]
+
+
+def test_a_memory_shows_a_bias_that_no_batch_shows(key):
+    """A jump of 0.2 in one of 40 coordinates, whose bias of 0.8 is lost in the noise of 16 samples, and is a seventh of it."""
+    objective = parameter_noise(lambda x: x.sum() + 0.2 * jnp.where(x[0] >= 0, 1.0, 0.0), 0.1, dim=40)
+    once = eqx.filter_jit(functools.partial(estimators.alpha_order, objective, jnp.zeros(40), num_samples=16))
+    memory, alphas = None, []
+    for k in jax.random.split(key, 60):
+        estimate = once(k, memory=memory)
+        memory = estimate.memory
+        alphas.append(float(estimate.alpha))
+    assert np.mean(alphas[:3]) > 0.8
+    assert np.mean(alphas[-20:]) < 0.35
+    off = memory.difference - jnp.zeros(40).at[0].set(0.2 * STEP)
+    # The squared error of the mean of 40 coordinates has a relative spread of sqrt(2/40).
+    assert abs((off**2).sum() / memory.noise - 1) < 1.0
+
+
+def test_a_memory_is_the_weighted_mean_of_its_estimates(key):
+    objective = BUMPY.sized_for(POINT)
+    found = [alpha_order(objective, POINT, k, num_samples=20).memory for k in jax.random.split(key, 5)]
+    memory = found[0]
+    for one in found[1:]:
+        memory = memory.with_more(one)
+    weights = 0.98 ** np.arange(4, -1, -1.0) / (0.98 ** np.arange(5)).sum()
+    for name, power in (("difference", 1), ("bound", 1), ("zeroth_width", 1), ("noise", 2), ("noise_square", 2)):
+        expected = sum(w**power * np.asarray(getattr(one, name)) for w, one in zip(weights, found, strict=True))
+        np.testing.assert_allclose(getattr(memory, name), expected, rtol=1e-9, err_msg=name)
+    np.testing.assert_allclose(1 / memory.concentration, 1 / (weights**2).sum(), rtol=1e-9)
+
+
+def test_the_noise_of_a_squared_bias_is_its_spread():
+    """Rows of unequal variances; without a bias the variance of the mean product of two is 2 tr Σ²/n(n - 1)."""
+    slopes = jnp.linspace(1, 0.2, 8)
+    objective = parameter_noise(lambda x: (slopes * x**2).sum() / 2, 0.1, dim=8)
+    facts = repeat(estimators.alpha_order, objective, jnp.zeros(8), 4000, seed=0, num_samples=12).memory
+    squared_bias = (np.asarray(facts.difference) ** 2).sum(axis=1) - facts.noise
+    standard_error = squared_bias.std() / np.sqrt(4000)
+    assert abs(squared_bias.mean()) < 4 * standard_error
+    np.testing.assert_allclose(np.sqrt(2 * (np.asarray(facts.noise_square) ** 2).mean()), squared_bias.std(), rtol=0.25)
+
+
+def test_an_estimate_that_is_not_finite_leaves_the_memory_as_it_is(key):
+    good = alpha_order(BUMPY, POINT, key, num_samples=20).memory
+    broken = parameter_noise(lambda x: textbook.bumpy(x) * jnp.nan, STDDEVS)
+    after = alpha_order(broken, POINT, key, num_samples=20, memory=good).memory
+    assert all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(good), jax.tree.leaves(after), strict=True))
 
 
 def test_the_bound_on_the_bias_holds_for_a_small_jump_in_many_dimensions(key):
-    """A jump of 0.05 in one of 40 coordinates passes the test; its bias is 0.05 φ(0)/σ, its bound sd(J)/σ."""
+    """A jump of 0.05 in one of 40 coordinates; its bias is 0.05 φ(0)/σ, its bound sd(J)/σ."""
     slope = jnp.linspace(1, 2, 40)
     objective = parameter_noise(lambda x: slope @ x + 0.05 * jnp.where(x[0] >= 0, 1.0, 0.0), 0.1, dim=40)
-    rule = rules.Consistent(failure_probability=1e-9)
-    estimate = alpha_order(objective, jnp.zeros(40), key, num_samples=200, rule=rule)
-    assert estimate.alpha > 0.5
+    estimate = alpha_order(objective, jnp.zeros(40), key, num_samples=200)
+    assert estimate.alpha > 0.1
     bias = 0.05 * norm.pdf(0) / 0.1
     assert bias * estimate.alpha < estimate.bias_bound
     # The standard deviation of a jump that half of the samples take is half of it.
@@ -89,7 +168,6 @@ def test_a_large_constant_changes_nothing_in_single_precision(key):
     plain = alpha_order(parameter_noise(cost, stddev), point, key, num_samples=64)
     lifted = alpha_order(parameter_noise(lambda x: cost(x) + 1000.0, stddev), point, key, num_samples=64)
     assert plain.value.dtype == jnp.float32
-    assert Reason[lifted.reason] != Reason[Reason.inconsistent]
     np.testing.assert_allclose(lifted.value, plain.value, rtol=0.05)
 
 

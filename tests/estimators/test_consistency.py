@@ -32,16 +32,13 @@ def test_the_sums_are_those_of_the_definition(key):
     sums, samples = sums_of(cost, key)
     x = np.asarray(POINT + samples.noise)
     costs, slopes = map(np.asarray, jax.jit(jax.vmap(jax.value_and_grad(cost)))(x))
-    residual = difference = missed = 0.0
+    missed = 0.0
     for j in range(40):
         for k in set(range(40)) - {j}:
             rest = costs[j] - costs[k] - (slopes[j] + slopes[k]) @ (x[j] - x[k]) / 2
-            distance = (((x[j] - x[k]) / np.asarray(STDDEVS)) ** 2).sum()
-            residual += rest**2 / distance
-            difference += (costs[j] - costs[k]) ** 2 / distance
             missed += rest**2 / 2
-    np.testing.assert_allclose(sums.inconsistency(), residual / difference, rtol=1e-9)
-    np.testing.assert_allclose(sums.missed / sums.pairs, missed / (40 * 39), rtol=1e-9)
+    np.testing.assert_allclose(sums.missed, missed, rtol=1e-9)
+    assert sums.pairs == 40 * 39
 
 
 def test_a_sample_without_derivative_is_compared_with_none(key):

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import norm
 
 import mjxgrad as mg
-from experiments.problems import estimators
-from mjxgrad.estimators import Reason
+from mjxgrad import estimators
+from mjxgrad.estimators import Reason, rules
 from mjxgrad.objective import parameter_noise
 from tests.estimators import textbook
 from tests.estimators.test_rules import assert_decides, evidence
@@ -129,13 +129,13 @@ def test_reinforce_needs_steps(key):
     [({"difference_norm": 1e9}, 0.8), ({"first_variance": 0.0, "zeroth_variance": 0.0}, 1.0)],
 )
 def test_inverse_variance_looks_at_variances_alone(changes, alpha):
-    assert_decides(estimators.InverseVariance(), evidence(**changes), alpha, Reason.inverse_variance, np.nan)
+    assert_decides(rules.InverseVariance(), evidence(**changes), alpha, Reason.inverse_variance, np.nan)
 
 
 def test_the_concavity_test_is_the_published_inequality():
     """V¹ = 0.5 and ‖g¹‖ = 2 allow a variance of the cost of (V¹ + 2 ‖g¹‖²) / (2 (1 - c))."""
     boundary = (0.5 + 2 * 2.0**2) / (2 * 0.7)
     for cost_variance, alpha in ((0.999 * boundary, 0.8), (1.001 * boundary, 0.0)):
-        weights = estimators.Concavity(slack=0.3)(evidence(cost_variance=cost_variance))
+        weights = rules.Concavity(slack=0.3)(evidence(cost_variance=cost_variance))
         np.testing.assert_allclose(weights.alpha, alpha)
     assert Reason[weights.reason] == Reason[Reason.inconsistent]

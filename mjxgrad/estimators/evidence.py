@@ -1,0 +1,121 @@
+r"""What a rule weighs by: the samples of one estimate, and what the last estimates of a descent showed of the bias.
+
+In a descent the noise of the steps averages out, and the bias does not: the mean of $T$ mixtures is off by
+$\alpha^2(V^1/T + b^2) + (1 - \alpha)^2 V^0/T$. So a bias counts $T$ times as much as in a single estimate. It is known
+better, too: a bias of a fifth of the gradient, that no batch of 16 samples shows, shows after thirty.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjxgrad.objective.base import Scalar, Vector
+
+# Half of what is known is of the last 34 steps.
+_STAYS = 0.98
+
+
+class Evidence(eqx.Module):
+    """The input of a rule, over all coordinates. Variances are traces of the covariance of one sample, or of one pair.
+
+    Attributes:
+        count: number of samples behind the means, or of pairs where starts are random.
+        dim: number of coordinates.
+        first_norm: norm of the mean derivative.
+        difference_norm: norm of the difference between the two means.
+        first_variance: variance of the derivative.
+        zeroth_variance: variance of the unbiased term.
+        difference_variance: variance of the difference; both parts share their rollouts.
+        cost_variance: variance of the cost.
+        scaled_first_variance: variance of derivatives by the noise in its standard deviations.
+        scaled_first_norm: norm of the mean of these derivatives.
+        squared_bias: unbiased estimate of the squared norm of the bias of the first order.
+        squared_bias_error: its standard error where there is no bias.
+        squared_bias_bound: bound on it by what derivatives miss.
+        zeroth_noise: noise of the mean of the unbiased terms that the mean derivative does not share.
+        first_noise: noise of the mean derivative that the other does not share.
+        num_estimates: number of estimates over which noise averages and bias does not, 1 without a memory.
+    """
+
+    count: Float[Array, "*batch"]
+    dim: Float[Array, "*batch"]
+    first_norm: Float[Array, "*batch"]
+    difference_norm: Float[Array, "*batch"]
+    first_variance: Float[Array, "*batch"]
+    zeroth_variance: Float[Array, "*batch"]
+    difference_variance: Float[Array, "*batch"]
+    cost_variance: Float[Array, "*batch"]
+    scaled_first_variance: Float[Array, "*batch"]
+    scaled_first_norm: Float[Array, "*batch"]
+    squared_bias: Float[Array, "*batch"]
+    squared_bias_error: Float[Array, "*batch"]
+    squared_bias_bound: Float[Array, "*batch"]
+    zeroth_noise: Float[Array, "*batch"]
+    first_noise: Float[Array, "*batch"]
+    num_estimates: Float[Array, "*batch"]
+
+    def least_variance(self) -> Float[Array, "*batch"]:
+        """Return the weight V⁰/(V⁰ + V¹) of the first order; 1 where both are zero."""
+        total = self.zeroth_variance + self.first_variance
+        return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
+
+    def with_memory(self, memory: "Memory") -> "Evidence":
+        """Return the evidence with what a memory, of this estimate too, knows of the bias."""
+        return dataclasses.replace(
+            self,
+            squared_bias=(memory.difference**2).sum() - memory.noise,
+            squared_bias_error=jnp.sqrt(2.0) * memory.noise_square,
+            squared_bias_bound=memory.bound,
+            zeroth_noise=memory.zeroth_width**2,
+            num_estimates=1 / memory.concentration,
+        )
+
+
+class Memory(eqx.Module):
+    r"""What the estimates of a descent showed of the bias: the mean difference between both parts, older ones counting less.
+
+    Attributes:
+        difference: mean difference between both parts.
+        noise: its noise, the trace of its covariance matrix.
+        noise_square: the norm of its covariance matrix, $\sqrt{\mathrm{tr}\,\Sigma^2}$; a sum of those of the estimates,
+            which is no less.
+        bound: mean bound on the squared bias.
+        zeroth_width: mean root of the noise of zeroth order. A step's own would give zeroth order less weight just where a
+            rare sample shows what derivatives miss.
+        weight: sum of the weights, 1 for the last estimate.
+        concentration: sum of their squares where they sum to one.
+    """
+
+    difference: Vector
+    noise: Scalar
+    noise_square: Scalar
+    bound: Scalar
+    zeroth_width: Scalar
+    weight: Scalar
+    concentration: Scalar
+
+    @classmethod
+    def of(cls, difference: Vector, evidence: Evidence) -> "Memory":
+        """Return the memory of one estimate."""
+        noise, one = evidence.difference_variance / evidence.count, jnp.ones_like(evidence.count)
+        square = evidence.squared_bias_error / jnp.sqrt(2.0)
+        return cls(difference, noise, square, evidence.squared_bias_bound, jnp.sqrt(evidence.zeroth_noise), one, one)
+
+    def with_more(self, new: "Memory") -> "Memory":
+        """Return the memory with that of a new estimate, which is left out where a number of it is not finite."""
+        weight = _STAYS * self.weight + 1
+        share = 1 / weight
+        more = Memory(
+            self.difference + share * (new.difference - self.difference),
+            (1 - share) ** 2 * self.noise + share**2 * new.noise,
+            (1 - share) ** 2 * self.noise_square + share**2 * new.noise_square,
+            self.bound + share * (new.bound - self.bound),
+            self.zeroth_width + share * (new.zeroth_width - self.zeroth_width),
+            weight,
+            (1 - share) ** 2 * self.concentration + share**2,
+        )
+        is_sound = jnp.isfinite(new.difference).all() & jnp.isfinite(new.noise + new.noise_square + new.bound)
+        return jax.tree.map(lambda old, x: jnp.where(is_sound, x, old), self, more)
