@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 _Function = TypeVar("_Function", bound=Callable)
 
@@ -26,19 +27,32 @@ def compiled(function: _Function) -> _Function:
     """Compile a function of arrays, or trees with arrays, once per shape and structure.
 
     Called with traced values it becomes part of the outer program, where more values may be known. The function must depend
-    on its arguments alone: other variables are read only once.
+    on its arguments alone: other variables are read only once. Where an argument cannot be told from others, since it has no
+    hash, each call is on its own.
     """
     program = eqx.filter_jit(function)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if is_traced((args, kwargs)):
+        # A setting may come as a number of numpy's; only a known one can decide a shape.
+        is_count = lambda x: eqx.is_array(x) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.integer)  # noqa: E731
+        kwargs = {k: int(x) if is_count(x) and not is_traced(x) else x for k, x in kwargs.items()}
+        if is_traced((args, kwargs)) or not _is_hashable((args, kwargs)):
             return function(*args, **kwargs)
         # Weak types belong to a program's signature: feeding results back would compile it a second time.
         strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731
         return program(*jax.tree.map(strong, args), **jax.tree.map(strong, kwargs))
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def _is_hashable(arguments: Any) -> bool:
+    leaves, structure = jax.tree.flatten(arguments)
+    try:
+        hash((structure, tuple(leaf for leaf in leaves if not eqx.is_array(leaf))))
+    except TypeError:
+        return False
+    return True
 
 
 _KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()

@@ -1,4 +1,8 @@
-"""Estimates of the gradient of a smoothed objective, all with the same call."""
+"""Estimates of the gradient of a smoothed objective, all with the same call.
+
+Each is compiled once per form of its arguments, and at each later call runs at once, also where the objective is made anew of
+the same functions. As under `jax.jit`, what a cost reads besides its arguments is read only the first time.
+"""
 
 from mjxgrad.estimators import rules
 from mjxgrad.estimators.estimate import Diagnosis, GradientEstimate, Reason

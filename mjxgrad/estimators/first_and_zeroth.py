@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
+from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, ScoreMoments, as_real
 from mjxgrad.estimators.samples import Plan, Samples, all_finite, check_baseline, stream
@@ -13,6 +14,7 @@ from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Vector
 
 
+@compiled
 def first_order(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:
@@ -45,6 +47,7 @@ def first_order(
     return first_order_result(stream(objective, vector, key, plan, first_order_summary), plan, restore)
 
 
+@compiled
 def zeroth_order(
     objective: Objective,
     params: PyTree,
@@ -90,6 +93,7 @@ def zeroth_order(
     return zeroth_order_result(stream(objective, vector, key, plan, zeroth_order_summary), plan, baseline, restore)
 
 
+@compiled
 def first_and_zeroth_order(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> tuple[GradientEstimate, GradientEstimate]:

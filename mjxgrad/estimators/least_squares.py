@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan, sample
 from mjxgrad.objective import Objective, OpenLoop, ParameterNoise, as_vector
 
 
+@compiled
 def least_squares(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
 from mjxgrad.estimators.evidence import Evidence, Memory
 from mjxgrad.estimators.moments import Moments, as_real
@@ -17,6 +18,7 @@ from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Scalar, Vector
 
 
+@compiled
 def alpha_order(
     objective: Objective,
     params: PyTree,
@@ -74,6 +76,7 @@ def alpha_order(
     )
 
 
+@compiled
 def control_variate(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int, chunk_size: int | None = None
 ) -> GradientEstimate:

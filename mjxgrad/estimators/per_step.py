@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble
 from mjxgrad.estimators.moments import Moments, as_real
 from mjxgrad.estimators.samples import Group, Plan, check_baseline, plan_by_noise, sample
@@ -11,6 +12,7 @@ from mjxgrad.estimators.unbiased import gram, unbiased_terms
 from mjxgrad.objective import ActionNoise, Objective, as_vector
 
 
+@compiled
 def reinforce(
     objective: Objective,
     params: PyTree,
@@ -107,6 +109,7 @@ def _checked(objective: Objective, baseline: str) -> ActionNoise:
     return objective
 
 
+@compiled
 def per_step_inverse_variance(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int
 ) -> GradientEstimate:

@@ -1,0 +1,396 @@
+"""The risk bench: squared errors of α-order and of the parts that it mixes, on closed forms, tasks and robots."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from pydantic import Field
+
+import mjxgrad as mg
+from experiments.motion import own_task
+from experiments.optimisation.published import TASKS
+from experiments.problems import textbook
+from experiments.report import Table
+from experiments.settings import OwnScene, Positive, RunSettings
+from experiments.theme import FIRST, MUTED, ONSET, ZEROTH, Drawings, subplots
+from experiments.words import percent, quantity
+from experiments.workspace import Workspace
+from mjxgrad.estimators import rules
+from mjxgrad.estimators.mixture import both_parts, weigh
+from mjxgrad.estimators.samples import Plan, Samples, plan_by_noise, sample
+from mjxgrad.objective import Objective, as_vector
+from mjxgrad.tasks import scene_path, wall_softness
+
+RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant", "cartpole", "planar_pusher"]
+TextbookName = Literal["heaviside", "soft_heaviside", "quadratic_sine"]
+TaskName = Literal["push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis"]
+FIRST_ORDER, ZEROTH_ORDER, ALPHA = "first order", "zeroth order", "α-order"
+_RULES: dict[str, rules.Rule] = {
+    "control variate": rules.FixedAlpha(0.0),
+    "inverse variance": rules.InverseVariance(),
+    "concavity (DDCG)": rules.Concavity(),
+    "trust region": rules.TrustRegion(),
+    ALPHA: rules.LeastRisk(),
+}
+METHODS = (FIRST_ORDER, ZEROTH_ORDER, *_RULES)
+_PART = 256  # rollouts that are made at a time
+_RESAMPLES = 400
+
+
+class Settings(OwnScene, RunSettings):
+    """Mean squared errors of estimates, over batches of the same rollouts."""
+
+    textbook: tuple[TextbookName, ...] = ("heaviside", "soft_heaviside", "quadratic_sine")
+    """Costs of one number with closed forms, also as the sum over many."""
+    points: tuple[float, ...] = (0.0, 0.1, 0.2)
+    """Where these are estimated, for a width of 0.1 of the noise."""
+    dims: tuple[Annotated[int, Field(ge=1)], ...] = (1, 40)
+    """Over how many numbers they are summed."""
+    tasks: tuple[TaskName, ...] = ("push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis")
+    """Published tasks, at their start and later."""
+    later: Annotated[int, Field(ge=0)] = 60
+    """Steps of their descent by an unbiased estimate, after which they are measured once more."""
+    walls: tuple[Positive, ...] = (1e2, 1e3, 1e4, 1e5)
+    """Stiffness of the wall in a throw (1/s²)."""
+    robots: tuple[RobotName, ...] = ("hopper", "walker2d", "half_cheetah", "ant", "cartpole", "planar_pusher")
+    """Of gymnasium and of mjcf/, by C MuJoCo; their controls under noise, by both derivatives."""
+    stddev: Positive = 0.3
+    """Of the noise on controls, in halves of their range."""
+    batches: Annotated[tuple[Annotated[int, Field(ge=4)], ...], Field(min_length=1)] = (16, 64, 256)
+    """Samples of an estimate."""
+    num_samples: Annotated[int, Field(ge=512)] = 4096
+    """Rollouts that are differentiated, in all batches together; on robots a quarter, on closed forms four times as many."""
+    num_truth: Annotated[int, Field(ge=4000)] = 64_000
+    """Rollouts without derivatives that the truth of robots is from."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One problem with one derivative, estimated by batches of one size.
+
+    Attributes:
+        error: mean squared errors by method, over the squared norm of the truth.
+        spread: their standard errors over batches.
+        ratio: error of α-order over that of the better of first and zeroth order.
+        ratio_interval: of 95 %, by resampling batches.
+        alpha: mean weight of α-order.
+        truth_error: squared error of the truth, over its squared norm; taken off from all errors.
+    """
+
+    problem: str
+    derivative: str
+    dim: int
+    batch: int
+    error: dict[str, float]
+    spread: dict[str, float]
+    ratio: float
+    ratio_interval: tuple[float, float]
+    alpha: float
+    truth_error: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All cells."""
+
+    settings: Settings
+    cells: list[Cell]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per cell, for metrics.csv."""
+        rows = []
+        for cell in self.cells:
+            row = {
+                name: getattr(cell, name)
+                for name in ("problem", "derivative", "dim", "batch", "ratio", "alpha", "truth_error")
+            }
+            rows.append(row | {f"error, {name}": value for name, value in cell.error.items()})
+        return rows
+
+    @property
+    def told(self) -> list[Cell]:
+        """Those whose truth is known better than the better part."""
+        return [
+            cell for cell in self.cells if min(cell.error[FIRST_ORDER], cell.error[ZEROTH_ORDER]) > cell.truth_error
+        ]
+
+    @property
+    def ratios(self) -> np.ndarray:
+        """Errors of α-order over those of the better part, in the cells that tell."""
+        return np.array([cell.ratio for cell in self.told])
+
+
+@dataclass(frozen=True)
+class _Problem:
+    name: str
+    derivative: str
+    objective: Objective
+    params: Array
+    truth: Callable[[], tuple[np.ndarray, float]]  # with its squared error
+    num_samples: int
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Estimate each problem by batches of its rollouts."""
+    made = _problems(settings)
+    cells = []
+    with workspace.stage("estimates", "problems", len(made)) as advance_to:
+        for i, make in enumerate(made):
+            cells += workspace.once(
+                f"{i}", functools.partial(_cells, make, settings, jax.random.key(settings.seed + i))
+            )
+            advance_to(i + 1)
+    return Outcome(settings, cells)
+
+
+def _problems(settings: Settings) -> list[Callable[[], _Problem]]:
+    if settings.scene is not None:
+        return [functools.partial(_own, settings, name) for name in ("discrete", "slope")]
+    made: list[Callable[[], _Problem]] = []
+    for name in settings.textbook:
+        made += [
+            functools.partial(_closed_form, settings, name, at, dim) for at in settings.points for dim in settings.dims
+        ]
+    made += [
+        functools.partial(_published, settings, name, steps) for name in settings.tasks for steps in (0, settings.later)
+    ]
+    made += [functools.partial(_throw, settings, stiffness) for stiffness in settings.walls]
+    made += [
+        functools.partial(_robot, settings, name, kind) for name in settings.robots for kind in ("discrete", "slope")
+    ]
+    return made
+
+
+def _closed_form(settings: Settings, name: str, at: float, dim: int) -> _Problem:
+    kinds = {
+        "heaviside": textbook.heaviside,
+        "soft_heaviside": lambda: textbook.soft_heaviside(0.01),
+        "quadratic_sine": lambda: textbook.quadratic_sine(0.1, 40.0),
+    }
+    one = kinds[name]()
+    objective = mg.parameter_noise(lambda x: jax.vmap(one)(x[:, None]).sum(), 0.1, dim)
+    exact = np.full(dim, float(one.gradient(at, 0.1)))
+    title = f"{name.replace('_', ' ')} at {at:g}" + (f", {dim} of them" if dim > 1 else "")
+    return _Problem(title, "exact", objective, jnp.full(dim, at), lambda: (exact, 0.0), 4 * settings.num_samples)
+
+
+def _published(settings: Settings, name: str, steps: int) -> _Problem:
+    task = TASKS[name]()
+    params = task.params
+    if steps:
+        unbiased = functools.partial(mg.estimators.control_variate, num_samples=100)
+        key = jax.random.key(settings.seed + 1)
+        optimiser = optax.sgd(task.learning_rate)
+        params = mg.optimise(
+            task.objective, params, key, estimator=unbiased, optimiser=optimiser, num_steps=steps
+        ).params
+    title = name.replace("_", " ") + (f", step {steps}" if steps else "")
+    truth = functools.partial(_by_many, settings, task.objective, params, mg.estimators.control_variate)
+    return _Problem(title, "exact", task.objective, params, truth, settings.num_samples)
+
+
+def _throw(settings: Settings, stiffness: float) -> _Problem:
+    objective = mg.tasks.ball_wall().objective(softness=wall_softness(stiffness))
+    params = jnp.array([0.6])
+    truth = functools.partial(_by_many, settings, objective, params, mg.estimators.control_variate)
+    return _Problem(
+        f"throw, wall of {stiffness:g} 1/s²", "discrete", objective, params, truth, settings.num_samples // 2
+    )
+
+
+# Time steps of a rollout.
+_HORIZONS = {"hopper": 50, "walker2d": 50, "half_cheetah": 50, "ant": 30, "cartpole": 100, "planar_pusher": 100}
+_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+
+def _robot(settings: Settings, name: str, kind: str) -> _Problem:
+    file = _ASSETS / f"{name}.xml"
+    scene = mg.load_scene(str(file if file.is_file() else scene_path(name))).with_engine("mujoco")
+    task = mg.SceneTask(scene, mg.initial_state(scene), lambda t: -t.qpos[-1, 0], horizon=_HORIZONS[name])
+    return _of_task(settings, name, kind, task)
+
+
+def _own(settings: Settings, kind: str) -> _Problem:
+    task = own_task(settings)
+    return _of_task(settings, Path(str(settings.scene)).stem, kind, task.with_engine("mujoco"))
+
+
+def _of_task(settings: Settings, name: str, kind: str, task: mg.SceneTask) -> _Problem:
+    contact = {"discrete": mg.Discrete(), "slope": mg.Slope()}[kind]
+    ranges = np.asarray(task.scene.model.actuator_ctrlrange)
+    is_limited = np.asarray(task.scene.model.actuator_ctrllimited).astype(bool)
+    halves = np.where(is_limited, (ranges[:, 1] - ranges[:, 0]) / 2, 1.0)
+    middle = np.where(is_limited, ranges.mean(axis=1), 0.0)
+    width = settings.stddev * jnp.broadcast_to(jnp.asarray(halves), (task.horizon, len(halves)))
+    objective = mg.open_loop(task.with_contact(contact), width)
+    params = jnp.tile(jnp.asarray(middle), task.horizon)
+    truth = functools.partial(_by_many, settings, mg.open_loop(task, width), params, _antithetic)
+    return _Problem(name.replace("_", " "), kind, objective, params, truth, settings.num_samples // 4)
+
+
+_antithetic = functools.partial(mg.estimators.zeroth_order, antithetic=True)
+
+
+def _by_many(settings: Settings, objective: Objective, params: Array, estimator: Callable) -> tuple[np.ndarray, float]:
+    """Return the mean of large unbiased estimates, and its squared error."""
+    run = jax.jit(lambda key: estimator(objective, params, key, num_samples=2000).value)
+    keys = jax.random.split(jax.random.key(settings.seed + 2), max(2, settings.num_truth // 2000))
+    found = np.array([run(key) for key in keys], float)
+    return found.mean(axis=0), float(found.var(axis=0, ddof=1).sum() / len(found))
+
+
+def _cells(make: Callable[[], _Problem], settings: Settings, key: Array) -> list[Cell]:
+    problem = make()
+    objective, params, _ = as_vector(problem.objective, problem.params)
+    plan = plan_by_noise(objective, _PART, None)
+    roll_out = jax.jit(lambda key: sample(objective, params, key, plan, jnp.arange(plan.num_units)))
+    parts = [jax.device_get(roll_out(k)) for k in jax.random.split(key, max(2, problem.num_samples // _PART))]
+    samples = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    truth, truth_error = problem.truth()
+    cells = []
+    for batch in settings.batches:
+        size = batch // plan.rollouts_per_unit
+        count = len(samples.is_noisy) // size
+        if count < 4:
+            continue
+        split = jax.tree.map(lambda leaf, n=count, m=size: leaf[: n * m].reshape(n, m, *leaf.shape[1:]), samples)
+        values, alpha = _estimates(plan, split)
+        cells.append(_cell(problem, params.size, batch, jax.device_get(values), alpha, truth, truth_error))
+    return cells
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _estimates(plan: Plan, batches: Samples) -> tuple[dict[str, Float[Array, "batches dim"]], Float[Array, " batches"]]:
+    """Return each method's estimates, one for each batch, and the weights of α-order."""
+
+    def one(batch: Samples) -> tuple[dict[str, Array], Array]:
+        parts, plain = (both_parts(batch, control_variate=with_derivatives) for with_derivatives in (True, False))
+        alphas = {name: weigh(rule, parts, plan).alpha for name, rule in _RULES.items()}
+        mixed = {name: parts.mixture(alpha)[0] for name, alpha in alphas.items()}
+        return {FIRST_ORDER: parts.first.mean, ZEROTH_ORDER: plain.unbiased.mean, **mixed}, alphas[ALPHA]
+
+    return jax.lax.map(one, batches)
+
+
+def _cell(
+    problem: _Problem, dim: int, batch: int, values: dict[str, Any], alpha: Any, truth: np.ndarray, truth_error: float
+) -> Cell:
+    squares = {
+        name: ((np.asarray(value, float) - truth) ** 2).sum(axis=1) - truth_error for name, value in values.items()
+    }
+    scale = max(float((truth**2).sum()) - truth_error, 1e-300)
+    number = len(squares[ALPHA])
+
+    def ratio(rows: np.ndarray) -> float:
+        means = {name: max(float(squares[name][rows].mean()), 1e-300) for name in (FIRST_ORDER, ZEROTH_ORDER, ALPHA)}
+        return means[ALPHA] / min(means[FIRST_ORDER], means[ZEROTH_ORDER])
+
+    rng = np.random.default_rng(0)
+    resampled = [ratio(rng.integers(0, number, number)) for _ in range(_RESAMPLES)]
+    low, high = np.quantile(resampled, [0.025, 0.975])
+    return Cell(
+        problem.name,
+        problem.derivative,
+        dim,
+        batch,
+        {name: float(x.mean() / scale) for name, x in squares.items()},
+        {name: float(x.std(ddof=1) / np.sqrt(number) / scale) for name, x in squares.items()},
+        ratio(np.arange(number)),
+        (float(low), float(high)),
+        float(np.mean(alpha)),
+        truth_error / scale,
+    )
+
+
+def answer(outcome: Outcome) -> str:
+    """Say how α-order compares with the better part."""
+    near, worst = (outcome.ratios <= 1.1).mean(), outcome.ratios.max()
+    return f"{percent(near)} of cells within 1.1 times the better part's error, worst {worst:.2f}."
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say where α-order helps, what it costs, and how others do."""
+    cells = outcome.told
+    below = [cell for cell in cells if cell.ratio_interval[1] < 0.9]
+    worst = cells[int(outcome.ratios.argmax())]
+    others = []
+    for name in METHODS[:-1]:
+        ratios = np.array([_ratio(cell, name) for cell in cells])
+        others.append(f"{name} {percent((ratios <= 1.1).mean())} and {quantity(ratios.max())}")
+    return (
+        f"In {len(below)} of {len(cells)} cells α-order is below both parts, beyond chance and by more than a tenth; it is worst "
+        f"on {worst.problem} ({worst.derivative}, {worst.batch} samples): {worst.ratio:.2f} times the better part. "
+        f"Within 1.1 times, and worst, of the others: {'; '.join(others)}."
+    )
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Say what is left out."""
+    left = len(outcome.cells) - len(outcome.told)
+    return [f"{left} cells are not counted: the better part's error is below that of the truth."] if left else []
+
+
+def _ratio(cell: Cell, name: str) -> float:
+    return max(cell.error[name], 1e-300) / max(min(cell.error[FIRST_ORDER], cell.error[ZEROTH_ORDER]), 1e-300)
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all cells."""
+    shown = (FIRST_ORDER, ZEROTH_ORDER, "control variate", "concavity (DDCG)", ALPHA)
+    rows, emphasised = [], set()
+    for i, cell in enumerate(outcome.told):
+        low, high = cell.ratio_interval
+        errors = [quantity(cell.error[name]) for name in shown]
+        told = [f"{cell.alpha:.2f}", f"{cell.ratio:.2f} ({low:.2f} to {high:.2f})"]
+        rows.append([cell.problem, cell.derivative, str(cell.dim), str(cell.batch), *errors, *told])
+        if high < 0.9:
+            emphasised.add((i, len(rows[-1]) - 1))
+    columns = ("problem", "derivative", "numbers", "samples", *shown, "α", "α-order over the better part")
+    caption = (
+        "Mean squared errors over the squared norm of the gradient. Intervals are of 95 %, over batches. In bold, α-order is "
+        "below both parts by more than a tenth."
+    )
+    return [Table(columns, rows, caption, frozenset(emphasised))]
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures."""
+    return {"risk": risk}
+
+
+def risk(outcome: Outcome):
+    """Errors of all parts and of α-order over the better part's, sorted."""
+    figure, axes = subplots(1, len(outcome.settings.batches), height=4.6, sharey=True)
+    looks = {
+        FIRST_ORDER: {"color": FIRST, "marker": "o"},
+        ZEROTH_ORDER: {"color": ZEROTH, "marker": "s"},
+        "concavity (DDCG)": {"color": MUTED, "marker": "x"},
+        ALPHA: {"color": ONSET, "marker": "D"},
+    }
+    for axis, batch in zip(axes[0], outcome.settings.batches, strict=True):
+        cells = sorted(
+            (c for c in outcome.told if c.batch == batch),
+            key=lambda c: c.error[FIRST_ORDER] / max(c.error[ZEROTH_ORDER], 1e-300),
+        )
+        for name, look in looks.items():
+            heights = [min(_ratio(cell, name), 1e4) for cell in cells]
+            axis.plot(range(len(cells)), heights, ls="", ms=4.5 if name == ALPHA else 3.5, label=name, **look)
+        axis.axhline(1, color=MUTED, lw=0.8)
+        axis.set(
+            title=f"{batch} samples", yscale="log", xlabel="problems, from first order's to zeroth order's", xticks=[]
+        )
+    axes[0][0].set_ylabel("squared error over that of the better part")
+    axes[0][0].legend(loc="upper center", fontsize=8.5)
+    caption = (
+        "Each column is one problem with one derivative: left, where first order is far ahead, right, where zeroth order is. "
+        "α-order stays near 1 or below; each of the others is far above on one side."
+    )
+    return figure, "Squared errors over those of the better part", caption
