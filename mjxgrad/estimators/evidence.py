@@ -19,7 +19,7 @@ _STAYS = 0.98
 
 
 class Evidence(eqx.Module):
-    """The input of a rule, over all coordinates. Variances are traces of the covariance of one sample, or of one pair.
+    r"""The input of a rule, over all coordinates. Variances are traces of the covariance of one sample, or of one pair.
 
     Attributes:
         count: number of samples behind the means, or of pairs where starts are random.
@@ -34,6 +34,7 @@ class Evidence(eqx.Module):
         scaled_first_norm: norm of the mean of these derivatives.
         squared_bias: unbiased estimate of the squared norm of the bias of the first order.
         squared_bias_error: its standard error where there is no bias.
+        noise_dim: number of coordinates that its noise is worth, $(\mathrm{tr}\,\Sigma)^2/\mathrm{tr}\,\Sigma^2$.
         squared_bias_bound: bound on it by what derivatives miss.
         zeroth_noise: noise of the mean of the unbiased terms that the mean derivative does not share.
         first_noise: noise of the mean derivative that the other does not share.
@@ -52,6 +53,7 @@ class Evidence(eqx.Module):
     scaled_first_norm: Float[Array, "*batch"]
     squared_bias: Float[Array, "*batch"]
     squared_bias_error: Float[Array, "*batch"]
+    noise_dim: Float[Array, "*batch"]
     squared_bias_bound: Float[Array, "*batch"]
     zeroth_noise: Float[Array, "*batch"]
     first_noise: Float[Array, "*batch"]
@@ -68,6 +70,7 @@ class Evidence(eqx.Module):
             self,
             squared_bias=(memory.difference**2).sum() - memory.noise,
             squared_bias_error=jnp.sqrt(2.0) * memory.noise_square,
+            noise_dim=noise_dim(memory.noise, memory.noise_square),
             squared_bias_bound=memory.bound,
             zeroth_noise=memory.zeroth_width**2,
             num_estimates=1 / memory.concentration,
@@ -119,3 +122,8 @@ class Memory(eqx.Module):
         )
         is_sound = jnp.isfinite(new.difference).all() & jnp.isfinite(new.noise + new.noise_square + new.bound)
         return jax.tree.map(lambda old, x: jnp.where(is_sound, x, old), self, more)
+
+
+def noise_dim(trace: Scalar, norm: Scalar) -> Scalar:
+    """Return the effective dimension of noise, from the trace and the norm of its covariance matrix; at least 1."""
+    return jnp.maximum(jnp.where(norm > 0, trace / jnp.where(norm > 0, norm, 1), 1) ** 2, 1)

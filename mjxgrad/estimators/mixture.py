@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
-from mjxgrad.estimators.evidence import Evidence, Memory
+from mjxgrad.estimators.evidence import Evidence, Memory, noise_dim
 from mjxgrad.estimators.moments import Moments, as_real
 from mjxgrad.estimators.rules import FixedAlpha, LeastRisk, Rule, Weights
 from mjxgrad.estimators.samples import Group, Plan, Samples, in_groups, plan_by_noise, stream
@@ -137,6 +137,7 @@ class Parts(eqx.Module):
             scaled_first_norm=jnp.linalg.norm(self.scaled.mean),
             squared_bias=excess,
             squared_bias_error=error,
+            noise_dim=noise_dim(noise / jnp.maximum(count, 1), error / jnp.sqrt(2.0)),
             squared_bias_bound=jnp.where(self.secants.pairs > 0, missed * width, jnp.inf),
             zeroth_noise=unshared[0],
             first_noise=unshared[1],

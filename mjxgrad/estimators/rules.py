@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from scipy import stats
 
-from mjxgrad._arrays import is_known, real
+from mjxgrad._arrays import is_known
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.estimators.evidence import Evidence
 
@@ -159,8 +159,10 @@ class LeastRisk(eqx.Module):
 
     Of two sources for $b^2$ the smaller counts:
 
-    - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it; one standard error is taken off. In many dimensions $D$ is
-      known to a small part of $V^0$, so that the mixture loses little to the better part whatever the bias.
+    - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it. In many dimensions it is known to a small part of $V^0$, so that
+      the mixture loses little to the better part whatever the bias. There one standard error is taken off, for else noise
+      counts as bias half of the time, and first order is given up where it is exact. In one dimension nothing is: biases as
+      large as the noise of zeroth order would stay unseen. Between, $1 - 1/p$ errors are, for noise worth $p$ coordinates.
     - $U$, by what derivatives leave unexplained in the costs, bounds it from above (see `SecantSums`). It is zero for a
       quadratic. Where samples are fewer than dimensions, it lies below $V^0$: no bias does more harm there than the noise of
       zeroth order.
@@ -171,23 +173,14 @@ class LeastRisk(eqx.Module):
     In a descent (see `Memory`) $D$ is that of the mean over its last steps, and $b^2$ counts as many times as there are steps
     over which noise averages.
 
-    Attributes:
-        errors: standard errors that are taken off $D$. With 0, noise is taken for bias half of the time, and first order is
-            given up where it is exact; with 2, biases as large as the noise of zeroth order stay unseen.
-
     References:
         Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators. Journal of the
         American Statistical Association 86, 1991 (weights from the squared difference). Chen, Qin. A two-sample test for
         high-dimensional data with applications to gene-set testing. Annals of Statistics 38, 2010 (D and its noise).
     """
 
-    errors: float = eqx.field(static=True, default=1.0)
-
-    def __check_init__(self):
-        real("errors", self.errors)
-
     def __call__(self, evidence: Evidence) -> Weights:
-        seen = evidence.squared_bias - self.errors * evidence.squared_bias_error
+        seen = evidence.squared_bias - (1 - 1 / evidence.noise_dim) * evidence.squared_bias_error
         bias = jnp.clip(seen, 0, evidence.squared_bias_bound)
         risk = evidence.zeroth_noise + (evidence.first_noise + evidence.num_estimates * bias)
         alpha = jnp.where(risk > 0, evidence.zeroth_noise / jnp.where(risk > 0, risk, 1), 1)

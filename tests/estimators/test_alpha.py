@@ -87,7 +87,8 @@ STEP = 1 / (np.sqrt(2 * np.pi) * 0.1)  # slope of a smoothed step of height 1 at
         pytest.param(lambda x: 3 * x[0] + 2 * jnp.where(x[0] >= 0, 1.0, 0.0), 1, 3 + 2 * STEP, 16, 1.15, id="jump"),
         pytest.param(lambda x: jnp.where(x >= 0, 1.0, 0.0).sum(), 40, STEP, 16, 1.0, id="jumps"),
         pytest.param(lambda x: jnp.where(x >= 0, 1.0, 0.0).sum(), 40, STEP, 64, 0.8, id="jumps, more samples"),
-        pytest.param(lambda x: jnp.where(x[0] >= 0.2, 1.0, 0.0), 1, STEP * np.exp(-2), 16, 1.5, id="rare jump"),
+        pytest.param(lambda x: jnp.where(x[0] >= 0.2, 1.0, 0.0), 1, STEP * np.exp(-2), 16, 1.4, id="rare jump"),
+        pytest.param(lambda x: jnp.where(x[0] >= 0.1, 1.0, 0.0), 1, STEP * np.exp(-0.5), 16, 1.5, id="hidden jump"),
     ],
 )
 def test_alpha_order_is_as_good_as_the_better_part(function, dim, truth, num_samples, most):

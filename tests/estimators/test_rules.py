@@ -25,6 +25,7 @@ def evidence(**changes) -> Evidence:
         "scaled_first_norm": 2.0,
         "squared_bias": -0.01,
         "squared_bias_error": 0.05,
+        "noise_dim": 1e12,
         "squared_bias_bound": 9.0,
         "zeroth_noise": 4 / 50,
         "first_noise": 1 / 50,
@@ -51,7 +52,8 @@ def assert_decides(rule, facts: Evidence, alpha: float, reason, bias_bound: floa
         (rules.LeastRisk(), {}, 0.8, Reason.inverse_variance, 0.8 * 3.0),
         # A squared bias of 0.35 less one error of 0.05; it counts once, or ten times, or as far as derivatives miss anything.
         (rules.LeastRisk(), {"squared_bias": 0.35}, 0.08 / 0.4, Reason.bias_limit, 0.2 * 3.0),
-        (rules.LeastRisk(errors=2.0), {"squared_bias": 0.4}, 0.08 / 0.4, Reason.bias_limit, 0.2 * 3.0),
+        (rules.LeastRisk(), {"squared_bias": 0.3, "noise_dim": 1.0}, 0.08 / 0.4, Reason.bias_limit, 0.2 * 3.0),
+        (rules.LeastRisk(), {"squared_bias": 0.325, "noise_dim": 2.0}, 0.08 / 0.4, Reason.bias_limit, 0.2 * 3.0),
         (
             rules.LeastRisk(),
             {"squared_bias": 0.35, "num_estimates": 10.0},
