@@ -303,6 +303,15 @@ def _before(totals: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     # Steps that a run did not do have no α.
     was_done = ~np.isnan(history.alpha)
-    names = ["fixed", "inverse_variance", "bias_limit", "uncertain", "inconsistent", "not_finite", "nothing_felt"]
+    names = [
+        "fixed",
+        "inverse_variance",
+        "bias_limit",
+        "uncertain",
+        "inconsistent",
+        "not_finite",
+        "nothing_felt",
+        "inside",
+    ]
     found = {name: np.asarray(history.reason == getattr(Reason, name)) & was_done for name in names}
     return {name: where for name, where in found.items() if where.any()}

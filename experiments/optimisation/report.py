@@ -174,6 +174,7 @@ _SENTENCES = {
     "not_finite": ("derivatives not finite", "#22262e"),
     "nothing_felt": ("nothing reaches the cost", "#6b2737"),
     "fixed": ("given", "#c9ced6"),
+    "inside": ("within zeroth order's error", "#d9c27a"),
 }
 _DARK = ("inconsistent", "not_finite", "nothing_felt")
 

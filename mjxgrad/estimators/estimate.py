@@ -35,13 +35,13 @@ class Reason(eqx.Enumeration):
     inverse_variance = "the weights are those of least variance: no bias was found, or none was looked for"
     bias_limit = "the first-order part is biased, so α is smaller than the variances ask for"
     uncertain = "the zeroth-order part is too noisy to bound the bias, so it stands alone"
-    inside = "the first-order part lies within the error of the zeroth-order part"
     inconsistent = "values and derivatives of the samples contradict each other, so the zeroth-order part stands alone"
     not_finite = "too few derivatives were finite, so the zeroth-order part stands alone"
     nothing_felt = (
         "all samples cost the same and no derivative differs from zero, so nothing that the parameters change reaches "
         "the cost"
     )
+    inside = "the first-order part lies within the error of the zeroth-order part"
 
 
 class GradientEstimate(eqx.Module, Printed):
@@ -65,7 +65,7 @@ class GradientEstimate(eqx.Module, Printed):
         reason: an item of `Reason`; every estimator may give `Reason.nothing_felt`.
         bias_bound: an upper bound on the norm of the bias of `value`, if the rule that chose `alpha` knows one. Zero for
             an unbiased estimate, NaN where nothing is known.
-        memory: what the next estimate of a descent can learn from this one; None where an estimator learns nothing.
+        memory: evidence that the next estimate of a descent takes over, see `alpha_order`; None from other estimators.
     """
 
     value: PyTree[Float[Array, "..."]]

@@ -1,4 +1,4 @@
-r"""What a rule weighs by: the samples of one estimate, and what the last estimates of a descent showed of the bias.
+r"""Evidence for rules: from the samples of one estimate, and on the bias from the last estimates of a descent.
 
 In a descent the noise of the steps averages out, and the bias does not: the mean of $T$ mixtures is off by
 $\alpha^2(V^1/T + b^2) + (1 - \alpha)^2 V^0/T$. So a bias counts $T$ times as much as in a single estimate. It is known
@@ -78,7 +78,7 @@ class Evidence(eqx.Module):
 
 
 class Memory(eqx.Module):
-    r"""What the estimates of a descent showed of the bias: the mean difference between both parts, older ones counting less.
+    r"""Evidence on the bias from all estimates of a descent: the mean difference of both parts, older ones counting less.
 
     Attributes:
         difference: mean difference between both parts.

@@ -120,8 +120,8 @@ def per_step_inverse_variance(
     whose derivatives pass through all contacts, may so be left to zeroth order and late ones to first. Like
     `rules.InverseVariance` it is blind to bias. All rollouts are in memory at once.
 
-    Arguments, errors and units are those of `alpha_order`. `alpha` is the mean weight. The standard error is from the spread
-    of the samples; it ignores that weights and baselines come from the same samples.
+    Arguments, errors and units are those of `alpha_order`. `alpha` is the mean weight. The standard error is the samples'
+    own spread; it ignores that weights and baselines come from the same samples.
 
     References:
         Onoda et al., arXiv:2604.18161 (IVW-H).

@@ -157,7 +157,7 @@ class LeastRisk(eqx.Module):
 
     $$\alpha = \frac{V^0}{V^0 + V^1 + b^2}.$$
 
-    Of two sources for $b^2$ the smaller counts:
+    Two sources tell $b^2$, and the smaller counts:
 
     - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it. In many dimensions it is known to a small part of $V^0$, so that
       the mixture loses little to the better part whatever the bias. There one standard error is taken off, for else noise
