@@ -27,9 +27,9 @@ from mjxgrad.estimators import rules
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.samples import Plan, Samples, plan_by_noise, sample
 from mjxgrad.objective import Objective, as_vector
-from mjxgrad.tasks import scene_path, wall_softness
+from mjxgrad.tasks import wall_softness
 
-RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant", "cartpole", "planar_pusher"]
+RobotName = Literal["hopper", "walker2d", "half_cheetah", "ant"]
 TextbookName = Literal["heaviside", "soft_heaviside", "quadratic_sine"]
 TaskName = Literal["push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis"]
 FIRST_ORDER, ZEROTH_ORDER, ALPHA = "first order", "zeroth order", "α-order"
@@ -60,8 +60,8 @@ class Settings(OwnScene, RunSettings):
     """Steps of their descent by an unbiased estimate, after which they are measured once more."""
     walls: tuple[Positive, ...] = (1e2, 1e3, 1e4, 1e5)
     """Stiffness of the wall in a throw (1/s²)."""
-    robots: tuple[RobotName, ...] = ("hopper", "walker2d", "half_cheetah", "ant", "cartpole", "planar_pusher")
-    """Of gymnasium and of mjcf/, by C MuJoCo; their controls under noise, by both derivatives."""
+    robots: tuple[RobotName, ...] = ("hopper", "walker2d", "half_cheetah", "ant")
+    """Of gymnasium, by C MuJoCo; their controls under noise, by both derivatives."""
     stddev: Positive = 0.3
     """Of the noise on controls, in halves of their range."""
     batches: Annotated[tuple[Annotated[int, Field(ge=4)], ...], Field(min_length=1)] = (16, 64, 256)
@@ -207,13 +207,12 @@ def _throw(settings: Settings, stiffness: float) -> _Problem:
 
 
 # Time steps of a rollout.
-_HORIZONS = {"hopper": 50, "walker2d": 50, "half_cheetah": 50, "ant": 30, "cartpole": 100, "planar_pusher": 100}
+_HORIZONS = {"hopper": 50, "walker2d": 50, "half_cheetah": 50, "ant": 30}
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
 def _robot(settings: Settings, name: str, kind: str) -> _Problem:
-    file = _ASSETS / f"{name}.xml"
-    scene = mg.load_scene(str(file if file.is_file() else scene_path(name))).with_engine("mujoco")
+    scene = mg.load_scene(str(_ASSETS / f"{name}.xml")).with_engine("mujoco")
     task = mg.SceneTask(scene, mg.initial_state(scene), lambda t: -t.qpos[-1, 0], horizon=_HORIZONS[name])
     return _of_task(settings, name, kind, task)
 
