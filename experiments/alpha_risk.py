@@ -334,7 +334,7 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say what is left out."""
     left = len(outcome.cells) - len(outcome.told)
-    return [f"{left} cells are not counted: the better part's error is below that of the truth."] if left else []
+    return [f"{left} of {len(outcome.cells)} cells are not counted: the better part's error is below that of the truth."] if left else []
 
 
 def _ratio(cell: Cell, name: str) -> float:
