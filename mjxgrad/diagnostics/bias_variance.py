@@ -13,6 +13,7 @@ error falls as 1/cells at a jump and faster elsewhere. Quadrature on regular poi
 
 import contextlib
 import dataclasses
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -347,12 +348,17 @@ def bias_variance(
 
     measure = _program(objective_of_softness, plan, has_alpha, num_reference if is_line else None)
     # Compiled here, since a thread does not see settings made by `with`, such as the precision.
-    compiled = compile_once(measure.lower(each[0], params, key), compiler_options)
+    lowered = measure.lower(each[0], params, key)
+    compiled = compile_once(lowered, compiler_options)
+    # C MuJoCo is called back. Two programs that wait for it at once leave JAX no thread on two cores to hand it their numbers.
+    num_workers = 1 if "callback" in lowered.as_text() else _WORKERS
+    alone = threading.Lock()
 
     def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
         measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
         if reference is not None:
-            found = reference(one, jax.random.fold_in(key, 0), num_reference)
+            with alone:
+                found = reference(one, jax.random.fold_in(key, 0), num_reference)
             measured |= dict(zip(("reference", "reference_error"), map(jnp.asarray, found), strict=True))
         elif not is_line:
             others = [jax.random.fold_in(key, i) for i in range(-(-num_reference // num_samples))]
@@ -363,7 +369,7 @@ def bias_variance(
 
     rows = []
     # The interruption closes the map, which then begins no other row.
-    with ThreadPoolExecutor(_WORKERS) as pool, contextlib.suppress(KeyboardInterrupt):
+    with ThreadPoolExecutor(num_workers) as pool, contextlib.suppress(KeyboardInterrupt):
         for done in pool.map(row, each):
             rows.append(done)
             if progress is not None:

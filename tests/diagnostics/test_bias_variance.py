@@ -1,5 +1,7 @@
 """Bias and variance, measured where both are known."""
 
+import time
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -259,3 +261,36 @@ def test_points_have_noise_of_their_own_and_softnesses_share_it():
     )
     assert (table.first.value[:, 0] != table.first.value[:, 1]).all()
     np.testing.assert_allclose(table.first.value[1], 2 * table.first.value[0], rtol=1e-9)
+
+
+def test_programs_that_are_called_back_run_one_at_a_time():
+    """Two that wait for C MuJoCo at once may wait for ever on two cores, since JAX has no thread left for their numbers."""
+    running, most = [0], [0]
+
+    def counted(x):
+        running[0] += 1
+        most[0] = max(most[0], running[0])
+        time.sleep(0.002)
+        running[0] -= 1
+        return np.asarray(x)
+
+    @jax.custom_jvp
+    def cost(x):
+        return jax.pure_callback(counted, jax.ShapeDtypeStruct((), x.dtype), x, vmap_method="sequential")
+
+    cost.defjvp(lambda primals, tangents: (cost(*primals), tangents[0]))
+
+    def reference(softness, key, count):
+        counted(0.0)
+        return np.zeros((3, 2)), np.ones((3, 2))
+
+    table = bias_variance(
+        lambda width: parameter_noise(lambda x: cost(x.sum()) / width, STDDEV, dim=2),
+        jnp.zeros((3, 2)),
+        jax.random.key(0),
+        softness=WIDTHS,
+        num_samples=8,
+        reference=reference,
+    )
+    assert np.isfinite(table.bias).all()
+    assert most[0] == 1
