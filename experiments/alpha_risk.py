@@ -188,7 +188,7 @@ def _published(settings: Settings, name: str, steps: int) -> _Problem:
     if steps:
         unbiased = functools.partial(mg.estimators.control_variate, num_samples=100)
         key = jax.random.key(settings.seed + 1)
-        optimiser = optax.sgd(task.learning_rate)
+        optimiser = optax.sgd(task.learning_rate)  # pyright: ignore[reportArgumentType]
         params = mg.optimise(
             task.objective, params, key, estimator=unbiased, optimiser=optimiser, num_steps=steps
         ).params
@@ -213,7 +213,8 @@ _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 def _robot(settings: Settings, name: str, kind: str) -> _Problem:
     scene = mg.load_scene(str(_ASSETS / f"{name}.xml")).with_engine("mujoco")
-    task = mg.SceneTask(scene, mg.initial_state(scene), lambda t: -t.qpos[-1, 0], horizon=_HORIZONS[name])
+    start, forwards = mg.initial_state(scene), lambda trajectory: -trajectory.qpos[-1, 0]
+    task = mg.SceneTask(scene, start, forwards, horizon=_HORIZONS[name])  # pyright: ignore[reportCallIssue]
     return _of_task(settings, name, kind, task)
 
 
@@ -334,7 +335,11 @@ def verdict(outcome: Outcome) -> str:
 def findings(outcome: Outcome) -> list[str]:
     """Say what is left out."""
     left = len(outcome.cells) - len(outcome.told)
-    return [f"{left} of {len(outcome.cells)} cells are not counted: the better part's error is below that of the truth."] if left else []
+    return (
+        [f"{left} of {len(outcome.cells)} cells are not counted: the better part's error is below that of the truth."]
+        if left
+        else []
+    )
 
 
 def _ratio(cell: Cell, name: str) -> float:
