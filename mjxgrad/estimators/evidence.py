@@ -65,8 +65,8 @@ class Evidence(eqx.Module):
         return jnp.where(total > 0, self.zeroth_variance / jnp.where(total > 0, total, 1), 1)
 
     def with_memory(self, memory: "Memory") -> "Evidence":
-        """Return the evidence with what a memory, of this estimate too, knows of the bias."""
-        return dataclasses.replace(
+        """Return the evidence with what a memory, of this estimate too, knows of the bias; an empty one knows nothing."""
+        pooled = dataclasses.replace(
             self,
             squared_bias=(memory.difference**2).sum() - memory.noise,
             squared_bias_error=jnp.sqrt(2.0) * memory.noise_square,
@@ -75,6 +75,7 @@ class Evidence(eqx.Module):
             zeroth_noise=memory.zeroth_width**2,
             num_estimates=1 / memory.concentration,
         )
+        return jax.tree.map(lambda own, other: jnp.where(memory.weight > 0, other, own), self, pooled)
 
 
 class Memory(eqx.Module):

@@ -181,6 +181,8 @@ class LeastRisk(eqx.Module):
 
     def __call__(self, evidence: Evidence) -> Weights:
         seen = evidence.squared_bias - (1 - 1 / evidence.noise_dim) * evidence.squared_bias_error
+        # Where the error overflows, as fourth powers of derivatives do in single precision, nothing is seen.
+        seen = jnp.where(jnp.isfinite(evidence.squared_bias_error), seen, 0)
         bias = jnp.clip(seen, 0, evidence.squared_bias_bound)
         risk = evidence.zeroth_noise + (evidence.first_noise + evidence.num_estimates * bias)
         alpha = jnp.where(risk > 0, evidence.zeroth_noise / jnp.where(risk > 0, risk, 1), 1)

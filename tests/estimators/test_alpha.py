@@ -172,6 +172,18 @@ def test_a_large_constant_changes_nothing_in_single_precision(key):
     np.testing.assert_allclose(lifted.value, plain.value, rtol=0.05)
 
 
+def test_derivatives_whose_fourth_powers_overflow_are_left_to_zeroth_order(key):
+    """1e11 and of either sign, in single precision; also for a descent whose memory is still empty."""
+    objective = parameter_noise(lambda x: (x + jnp.sin(jnp.float32(1e11) * x)).sum(), jnp.float32(0.1))
+    point = jnp.zeros(3, jnp.float32)
+    alone = alpha_order(objective, point, key, num_samples=16)
+    empty = jax.tree.map(jnp.zeros_like, alone.memory)
+    assert not np.isfinite(alone.memory.noise_square)
+    for estimate in (alone, alpha_order(objective, point, key, num_samples=16, memory=empty)):
+        assert estimate.alpha < 1e-6
+        assert np.isfinite(estimate.value).all()
+
+
 def test_without_finite_derivatives_the_unbiased_part_stands_alone(key):
     objective = parameter_noise(lambda x: jnp.sqrt(jnp.maximum(x[0], 0)), 0.1, dim=1)
     # Everything is at -1 or below: costs are zero and derivatives NaN.
