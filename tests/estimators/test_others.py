@@ -139,3 +139,16 @@ def test_the_concavity_test_is_the_published_inequality():
         weights = rules.Concavity(slack=0.3)(evidence(cost_variance=cost_variance))
         np.testing.assert_allclose(weights.alpha, alpha)
     assert Reason[weights.reason] == Reason[Reason.inconsistent]
+
+
+def test_every_component_is_weighed_by_its_own_variances(key):
+    """The definition written out: terms with the leave-one-out mean, variances by component, their quotient."""
+    objective = parameter_noise(textbook.bumpy, STDDEVS)
+    noise = np.array([objective.sized_for(POINT).sample_noise(jax.random.fold_in(key, i)) for i in range(30)])
+    costs, slopes = map(np.asarray, jax.vmap(jax.value_and_grad(textbook.bumpy))(POINT + jnp.asarray(noise)))
+    zeroth = 30 / 29 * (costs - costs.mean())[:, None] * noise / np.asarray(STDDEVS) ** 2
+    first_variance, zeroth_variance = slopes.var(axis=0, ddof=1), zeroth.var(axis=0, ddof=1)
+    alpha = zeroth_variance / (zeroth_variance + first_variance)
+    estimate = estimators.per_step_inverse_variance(objective, POINT, key, num_samples=30)
+    np.testing.assert_allclose(estimate.value, (alpha * slopes + (1 - alpha) * zeroth).mean(axis=0), rtol=1e-7)
+    np.testing.assert_allclose(estimate.alpha, alpha.mean(), rtol=1e-9)
