@@ -1,7 +1,7 @@
 """Planning through contact: trajectory optimisation on smoothed linear models, and control by it."""
 
 from mjxgrad.planning.controller import Controller
-from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
+from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
 
@@ -15,6 +15,7 @@ __all__ = [
     "Iterations",
     "LinearModel",
     "Plan",
+    "Sampled",
     "SceneSystem",
     "Smoother",
     "System",
