@@ -175,6 +175,7 @@ FOUND = {
     "mg.step(balls.model, balls.data, contact=mg.Onset(jnp.ones(3)))": "width must be one value",
     "mg.Smoothing([1e-3, jnp.inf])": "length must be positive",
     "mg.Smoothing(1e-3, mode='both')": "mode must be one of 'forward', 'backward', got 'both'",
+    "mg.Smoothing(1e-3, kernel='cauchy')": "kernel must be one of 'gaussian', 'logistic', 'log_barrier', got 'cauchy'",
     "mg.step(balls.model, balls.data, contact=mg.Smoothing([1e-3, 2e-3]))": "length must be one value for a step, got",
     "mg.step(balls.model, balls.data, contact=mg.Slope('mujoco'))": 'engine None or "mjx" in a step of MJX, got "mujoco"',
     "own_motion('event')": "gradient must be one of 'discrete', 'slope', got 'event'",

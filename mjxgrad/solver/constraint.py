@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjxgrad.batched.linear import add, sum_of_few
-from mjxgrad.solver.noise import ramp, share
+from mjxgrad.solver.noise import KERNELS, Kernel
 
 _PerRow = Float[Array, "rows *batch"]
 _PerContact = Float[Array, "contacts *batch"]
@@ -61,6 +61,7 @@ class RowLayout:
     num_rows: int
     cones: tuple[ConeGroup, ...] = ()
     first_noisy: int | None = None
+    kernel: Kernel = KERNELS["gaussian"]  # of the noise, if there is any
 
     @property
     def friction(self) -> slice:
@@ -113,7 +114,7 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
     ]
     if layout.first_noisy is not None:
         noisy = slice(layout.hard_stop, layout.simple_stop)
-        parts.append(rows.weight[noisy] * _mean_violation(x[noisy], _noise_at(rows, noisy))[0])
+        parts.append(rows.weight[noisy] * _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
     for k in range(len(layout.cones)):
         parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
@@ -174,7 +175,7 @@ def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array,
     if layout.first_noisy is None:
         return curvature
     noisy = slice(layout.hard_stop, layout.simple_stop)
-    probability = _mean_violation(x[noisy], _noise_at(rows, noisy))[1]
+    probability = _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[1]
     return jnp.concatenate([curvature, rows.weight[noisy] * probability])
 
 
@@ -258,11 +259,11 @@ def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _Noi
     noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
     first = Noise(mu * noise.spread, mu * noise.gate)
     second = Noise(mu * first.spread, mu * first.gate)
-    violation1, share1 = _mean_violation(normal - mu * slip, first)
-    violation2, share2 = _mean_violation(mu * normal + slip, second)
+    violation1, share1 = _mean_violation(layout.kernel, normal - mu * slip, first)
+    violation2, share2 = _mean_violation(layout.kernel, mu * normal + slip, second)
     # The tangential force per slip. At small slip the two terms nearly cancel. There the mean of the derivative over the
     # slip is taken instead, by the trapezoidal rule: its second-order error equals rounding at the cube root of eps.
-    still = _mean_violation(normal, first)[1]
+    still = _mean_violation(layout.kernel, normal, first)[1]
     smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
     is_small = slip < smallest
     moving = (mu * violation1 - violation2) / jnp.where(is_small, 1.0, slip)
@@ -280,7 +281,7 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
     return Noise(rows.noise.spread[which], rows.noise.gate[which])
 
 
-def _mean_violation(x: _PerRow, noise: Noise) -> tuple[_PerRow, _PerRow]:
+def _mean_violation(kernel: Kernel, x: _PerRow, noise: Noise) -> tuple[_PerRow, _PerRow]:
     """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.
 
     Above the gate the acceleration ends the force before the distance does, and the mean is the softened ramp. Below the
@@ -288,5 +289,5 @@ def _mean_violation(x: _PerRow, noise: Noise) -> tuple[_PerRow, _PerRow]:
     """
     held = jnp.where(x > noise.gate, x, noise.gate)
     near = held / noise.spread
-    probability = share(near)
-    return noise.spread * ramp(near) + probability * (held - x), probability
+    probability = kernel.share(near)
+    return noise.spread * kernel.ramp(near) + probability * (held - x), probability

@@ -1,18 +1,35 @@
-r"""Gaussian noise on the distance of a contact: its mean force, in closed form.
+r"""Noise on the distance of a contact: its mean force in closed form, for several distributions.
 
-The force of a contact is the ramp $\max(-r, 0)$ of its distance $r$. Under standard normal noise $w$ on the distance it becomes
+The force of a contact is the ramp $\max(-r, 0)$ of its distance $r$. Under noise $w$ of density $\rho$ on the distance it becomes
 
-$$S(r) = \mathbb{E} \max(-r - w, 0) = \varphi(r) - r\,\Phi(-r), \qquad S'(r) = -P(w < -r), \qquad S''(r) = \varphi(r).$$
+$$S(r) = \mathbb{E} \max(-r - w, 0), \qquad S'(r) = -P(w < -r), \qquad S''(r) = \rho(-r).$$
 
-Distances are in units of the *length*, the standard deviation. At the surface $S(0) = \mathbb{E}|w| / 2 = 1 / \sqrt{2\pi}$.
+Read backwards, a force at a distance $F$ that deep inside runs along $-s\,r$ is the mean under the density $F''(-w) / s$: exactly
+if $F$ is convex and asymptotic to that ramp. An impedance that rises with depth is not convex; a margin shifts a ramp.
+
+All densities are even. Distances are in units of the *length*, the standard deviation of the Gaussian. The others are scaled to
+its mean $|w|$, and so to the same force at the surface, $S(0) = \mathbb{E}|w| / 2 = 1 / \sqrt{2\pi}$. Standard deviations
+could not be matched, since the log barrier's is infinite.
+
+| kernel | softened ramp | density | standard deviation | far away |
+|---|---|---|---|---|
+| `gaussian` | $\varphi(r) - r\,\Phi(-r)$ | normal | 1 | $e^{-r^2/2} / r^2$ |
+| `logistic` | $\beta\,\mathrm{softplus}(-r/\beta)$, $\beta = 0.576$ | logistic | $\pi \beta / \sqrt 3 = 1.044$ | $e^{-r/\beta}$ |
+| `log_barrier` | $(-r + \sqrt{r^2 + 4/\kappa}) / 2$, $\kappa = 2\pi$ | Student's t, 2 degrees of freedom | infinite | $1 / r$ |
+
+The ramp is the $f \ge 0$ that minimises $f^2/2 + f r$. With the barrier $-\log(f)/\kappa$ in place of the bound, the minimiser is
+the log barrier's $S(r)$, whose density is $2\sqrt\kappa / (4 + \kappa w^2)^{3/2}$.
 
 References:
     Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic
-    Contact Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing of contact).
+    Contact Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing of contact, and the log barrier as
+    an analytic one).
 """
 
+import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +38,35 @@ from jaxtyping import Array, Float
 from scipy import special
 
 _Shape = Float[Array, "*shape"]
-REACH = 6.0
-"""Distance beyond which `share` is below 1e-8, and `depth` is held."""
+# Mean of |w| under every kernel, β of the logistic, and 4/κ of the log barrier.
+_MEAN_SIZE = math.sqrt(2 / math.pi)
+_BETA = _MEAN_SIZE / (2 * math.log(2))
+_SQUARE = _MEAN_SIZE**2
 # Fit of the normal tail: degree by the size of a number in bytes, with relative errors of 9e-8 and 1e-14.
 _TAIL_SCALE = 3.0
 _TAIL_DEGREE = {4: 10, 8: 24}
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """A distribution of noise, and the mean force of a contact under it; static, since it shapes the compiled program.
+
+    Attributes:
+        reach: distance beyond which `share` is below 1e-8, and `depth` is held.
+        ramp: mean force at a distance.
+        share: probability of contact at a distance, minus the slope of `ramp`.
+        density: density of the noise, minus the slope of `share`.
+    """
+
+    reach: float
+    ramp: Callable[[_Shape], _Shape]
+    share: Callable[[_Shape], _Shape]
+    density: Callable[[_Shape], _Shape]
+
+    def depth(self, distance: _Shape) -> _Shape:
+        """Return the mean penetration given contact; constant beyond `reach`, where contact is improbable."""
+        near = jnp.minimum(distance, self.reach)
+        return self.ramp(near) / self.share(near)
 
 
 @functools.cache
@@ -40,8 +81,8 @@ def _tail_coefficients(degree: int) -> tuple[float, ...]:
 
 
 @jax.custom_jvp
-def share(r: _Shape) -> _Shape:
-    """Return Φ(-r), the probability of contact at a distance, to relative rounding for either sign of r.
+def _normal_share(r: _Shape) -> _Shape:
+    """Return Φ(-r) to relative rounding for either sign of r.
 
     Not by `jax.lax.erfc`, which ends in polynomials: XLA considers them cheap and evaluates them again for every entry of
     the Hessian. An exponential is computed once and stored.
@@ -54,28 +95,55 @@ def share(r: _Shape) -> _Shape:
     return jnp.where(r > 0, tail, 1 - tail)
 
 
-@share.defjvp
+@_normal_share.defjvp
 def _share_jvp(primals, tangents):
-    return share(*primals), -density(*primals) * tangents[0]
+    return _normal_share(*primals), -_normal_density(*primals) * tangents[0]
 
 
 @jax.custom_jvp
-def ramp(r: _Shape) -> _Shape:
-    """Return the mean force φ(r) - r Φ(-r) at a distance, to a few units of relative rounding times r²."""
-    return density(r) - r * share(r)
+def _normal_ramp(r: _Shape) -> _Shape:
+    """Return φ(r) - r Φ(-r) to a few units of relative rounding times r²."""
+    return _normal_density(r) - r * _normal_share(r)
 
 
-@ramp.defjvp
+@_normal_ramp.defjvp
 def _ramp_jvp(primals, tangents):
-    return ramp(*primals), -share(*primals) * tangents[0]
+    return _normal_ramp(*primals), -_normal_share(*primals) * tangents[0]
 
 
-def density(w: _Shape) -> _Shape:
-    """Return φ(w)."""
+def _normal_density(w: _Shape) -> _Shape:
     return jnp.exp(-0.5 * w**2) * (1 / math.sqrt(2 * math.pi))
 
 
-def depth(distance: _Shape) -> _Shape:
-    """Return the mean penetration given contact; constant beyond `REACH`, where contact is improbable."""
-    near = jnp.minimum(distance, REACH)
-    return ramp(near) / share(near)
+def _logistic_ramp(r: _Shape) -> _Shape:
+    return _BETA * jax.nn.softplus(-r / _BETA)
+
+
+def _logistic_share(r: _Shape) -> _Shape:
+    return jax.nn.sigmoid(-r / _BETA)
+
+
+def _logistic_density(w: _Shape) -> _Shape:
+    return _logistic_share(w) * _logistic_share(-w) / _BETA
+
+
+def _barrier_ramp(r: _Shape) -> _Shape:
+    # Two forms of the same number: each cancels on the other side.
+    root = jnp.sqrt(r**2 + _SQUARE)
+    return jnp.where(r > 0, 0.5 * _SQUARE / (root + jnp.abs(r)), 0.5 * (root - r))
+
+
+def _barrier_share(r: _Shape) -> _Shape:
+    return _barrier_ramp(r) / jnp.sqrt(r**2 + _SQUARE)
+
+
+def _barrier_density(w: _Shape) -> _Shape:
+    root = jnp.sqrt(w**2 + _SQUARE)
+    return 0.5 * _SQUARE / root / root / root
+
+
+KERNELS: dict[str, Kernel] = {
+    "gaussian": Kernel(6.0, _normal_ramp, _normal_share, _normal_density),
+    "logistic": Kernel(11.0, _logistic_ramp, _logistic_share, _logistic_density),
+    "log_barrier": Kernel(1e4, _barrier_ramp, _barrier_share, _barrier_density),
+}

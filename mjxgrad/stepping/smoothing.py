@@ -41,8 +41,8 @@ from mjxgrad._mjx import mjx
 from mjxgrad.contact.collision import CONVEX, are, is_blind
 from mjxgrad.contact.law import impedance, stiffness_damping
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.solver import noise as normal
 from mjxgrad.solver.constraint import Noise, RowLayout
+from mjxgrad.solver.noise import KERNELS
 from mjxgrad.stepping.rows import Block
 
 Mode = Literal["forward", "backward"]
@@ -54,26 +54,43 @@ _WEIGHTLESS = 1e30
 
 
 class Smoothing(eqx.Module):
-    """Gaussian noise on the distance of every contact, averaged in the solver without sampling.
+    """Noise on the distance of every contact, averaged in the solver without sampling.
 
     A pytree whose lengths are leaves: a sweep over them is one `jax.vmap`, and the step can be differentiated by them.
 
     Attributes:
-        length: standard deviation of the noise (m); contacts act from a few lengths away.
+        length: standard deviation of Gaussian noise (m); noise of other kernels has the mean absolute value of that, 0.798
+            lengths, and so the same force at the surface.
         mode: "forward" simulates the smoothed contact, with force at a distance and its derivatives. "backward" simulates
             without smoothing, and takes the derivative of the smoothed step at each visited state.
+        kernel: "gaussian", whose contacts act from a few lengths away; "logistic", whose force falls off exponentially, with a
+            standard deviation of 1.044 lengths; or "log_barrier", whose force falls off as 1/r and reaches everything: Student's
+            t with two degrees of freedom, a standard deviation that is infinite, and a barrier weight of 2π / length².
     """
 
     length: Float[Array, "..."] = eqx.field(converter=functools.partial(as_float, name="length"))
-    # A plain string, so that unknown names reach the check below, which lists the choices.
+    # Plain strings, so that unknown names reach the check below, which lists the choices.
     mode: str = eqx.field(static=True, default="forward")
+    kernel: str = eqx.field(static=True, default="gaussian")
 
     def __check_init__(self):
-        if self.mode not in get_args(Mode):
-            raise ValueError(f"mode must be one of {', '.join(map(repr, get_args(Mode)))}, got {self.mode!r}")
+        for name, choices in (("mode", get_args(Mode)), ("kernel", tuple(KERNELS))):
+            if (given := getattr(self, name)) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
         if is_known(self.length) and not np.all((np.asarray(self.length) > 0) & np.isfinite(self.length)):
             remedy = "for MuJoCo's own motion take mg.Discrete()"
             raise ValueError(f"length must be positive and finite, got {np.asarray(self.length)!s}: {remedy}")
+
+    def density(self, noise: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        r"""Return the density of the noise that contacts are averaged over (1/m).
+
+        Without motion the force at a distance $r$ is $k \,\mathbb{E} \max(-r - w, 0)$, with $k$ the contact's stiffness. So
+        the density at $w$ is the force's second derivative at $r = -w$, over $k$. `solver.noise` has the formulas.
+
+        Args:
+            noise: noise on the distance (m).
+        """
+        return KERNELS[self.kernel].density(noise / self.length) / self.length
 
 
 def smoothing_warnings(model: mjx.Model) -> list[str]:
@@ -118,7 +135,7 @@ def smoothed(
     if first is None:
         return blocks, None, layout
     noise = Noise(*(jnp.concatenate([getattr(n, name) for n in noises]) for name in ("spread", "gate")))
-    return rows, noise, dataclasses.replace(layout, first_noisy=first)
+    return rows, noise, dataclasses.replace(layout, first_noisy=first, kernel=KERNELS[smoothing.kernel])
 
 
 def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothing: Smoothing) -> tuple[Block, Noise]:
@@ -126,7 +143,7 @@ def noisy(model: mjx.Model, block: Block, known: Bool[Array, " groups"], smoothi
     each, length = block.rows_each, smoothing.length.astype(block.residual.dtype)
     distance = jnp.where(known, block.residual[::each], 1.0)
     # Impedance at the mean of -(r + w) given that it is positive (m).
-    resistance = impedance(block.solimp[::each], length * normal.depth(distance / length))
+    resistance = impedance(block.solimp[::each], length * KERNELS[smoothing.kernel].depth(distance / length))
     spread = functools.partial(jnp.repeat, repeats=each, axis=0)
     stiffness = stiffness_damping(model, block.solref, block.impedance.full)[0][::each]
     rate = jnp.maximum(stiffness * resistance.present, _SOFTEST)

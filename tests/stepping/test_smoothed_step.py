@@ -5,6 +5,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from scipy import optimize
@@ -14,6 +15,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.scene import SceneWarning
 from mjxgrad.stepping import smoothing_warnings
 from tests.scenes import put
+from tests.solver.test_noise import DISTRIBUTIONS, kernels
 from tests.solver.test_smoothed_law import _nodes
 
 # A ball that can move up and sideways over a plane, and a slider with a limit; impedance rises with depth.
@@ -55,13 +57,14 @@ scenes = pytest.mark.parametrize(
 )
 
 
-def test_acceleration_balances_the_mean_force_under_noise():
+@kernels
+def test_acceleration_balances_the_mean_force_under_noise(name):
     """Root of a + g = F(a), the force averaged over noise by quadrature: the solve's own accuracy, 1e-8.
 
     solref is (0.02, 1), so K = (dw tc)⁻², B = 2 / (dw tc); the compiled inverse weight is 1/m. With power 2 and midpoint 1/2 the
     impedance at depth e < width / 2 is d0 + (dw - d0) 2 (e/width)²; e is the mean penetration under noise where there is one.
     """
-    w, share = _nodes(np.array([-HEIGHT / LENGTH]))
+    w, share = _nodes(np.array([-HEIGHT / LENGTH]), name)
     touches = LENGTH * w < -HEIGHT
     depth = -np.sum(share * (HEIGHT + LENGTH * w) * touches) / np.sum(share * touches)
     assert depth < 0.5 * 4e-3
@@ -71,20 +74,44 @@ def test_acceleration_balances_the_mean_force_under_noise():
     def excess(a):
         x = a + damping * SINK + rate * HEIGHT
         last = min(-HEIGHT, -x / rate) / LENGTH
-        w, share = _nodes(np.array([last]))
+        w, share = _nodes(np.array([last]), name)
         push = np.where(w < last, x + rate * LENGTH * w, 0.0)
         return 2 * (a + 9.81) + weight * np.sum(share * push)
 
     exact = optimize.brentq(excess, -20, 100, xtol=1e-13)
-    found = _at(HEIGHT, contact=mg.Smoothing(LENGTH))[0]
+    found = _at(HEIGHT, contact=mg.Smoothing(LENGTH, kernel=name))[0]
     assert found == pytest.approx(exact, rel=1e-8)
     assert found > -9.0  # it is not the fall
 
 
+@kernels
+def test_its_force_is_the_mean_of_mujoco_s_over_samples_of_the_density(name):
+    """C MuJoCo's at the same acceleration, by inverse dynamics, within 4 standard errors; the impedance is that of any depth.
+
+    Student's t has no variance, but means over their own standard errors tend to a normal distribution there, too.
+    """
+    native = mujoco.MjModel.from_xml_string(SCENE.format(cone="pyramidal", dim=1))
+    native.geom_solimp[:] = [0.8, 0.8, 4e-3, 0.5, 2]
+    model, at = _scene()[0].tree_replace({"geom_solimp": jnp.asarray(native.geom_solimp)}), mujoco.MjData(native)
+    velocity, smoothing = jnp.array([SINK, 0.0, 0.0]), mg.Smoothing(LENGTH, kernel=name)
+    random = np.random.default_rng(3)
+    for height in (-LENGTH, 0.5 * LENGTH, 3 * LENGTH):
+        acceleration = np.asarray(_acceleration(model, _scene()[1], jnp.array([height, 0, 0]), velocity, smoothing))
+        forces = []
+        for w in LENGTH * DISTRIBUTIONS[name].ppf(random.uniform(size=4000)):
+            at.qpos[:], at.qvel[:], at.qacc[:] = [height + w, 0, 0], velocity, acceleration
+            mujoco.mj_inverse(native, at)
+            forces.append(at.qfrc_constraint[0])
+        mean, error = np.mean(forces), np.std(forces) / len(forces) ** 0.5
+        assert abs(2 * (acceleration[0] + 9.81) - mean) < 4 * error
+        assert error < (0.05 if height < 0 else 0.5) * mean
+
+
+@kernels
 @scenes
-def test_without_length_it_is_the_step_of_mujoco(scene):
+def test_without_length_it_is_the_step_of_mujoco(scene, name):
     """Noise of a tenth of a micrometre; the impedance's slope times that depth, 1e-7 / 4e-3 of the force, and less."""
-    small = mg.Smoothing(1e-7)
+    small = mg.Smoothing(1e-7, kernel=name)
     for height in (-1e-3, 1e-3, 0.3):
         found, hard = (_at(height, slide=0.4, contact=s, **scene) for s in (small, mg.Discrete()))
         np.testing.assert_allclose(found, hard, rtol=1e-4, atol=1e-6)
@@ -97,14 +124,15 @@ def test_an_approaching_body_is_not_braked_from_afar_nor_is_a_limit_smoothed():
     assert found[2] == 0
 
 
+@pytest.mark.parametrize("name", ["gaussian", pytest.param("logistic", marks=pytest.mark.slow), "log_barrier"])
 @scenes
-def test_derivatives_are_central_differences(scene):
+def test_derivatives_are_central_differences(scene, name):
     """By height, velocities and length; differences of width 1e-6 of a law that bends over 1e-3: 1e-6."""
     model, data = _scene(**scene)
 
     def outcome(p):
         position, velocity = jnp.array([p[0], 0.0, 0.0]), jnp.array([p[1], p[2], 0.0])
-        moved = mg.step(model, data.replace(qpos=position, qvel=velocity), contact=mg.Smoothing(p[3]))
+        moved = mg.step(model, data.replace(qpos=position, qvel=velocity), contact=mg.Smoothing(p[3], kernel=name))
         return jnp.dot(moved.qvel, jnp.array([1.0, 0.7, 0.0]))
 
     point = jnp.array([HEIGHT, SINK, 0.3, LENGTH])
