@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
+from matplotlib.ticker import PercentFormatter
 
 from experiments.report import Table
 from experiments.stability.measure import (
@@ -187,9 +188,47 @@ _UNITS = {
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name a figure per kind of scene, the planes of its first scene."""
+    """Name a figure of all scenes, and one per kind of scene, the planes of its first scene."""
     shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
-    return {re.sub(r"\W", "_", one.scene.name): functools.partial(_planes, one) for one in reversed(shown.values())}
+    planes = {re.sub(r"\W", "_", one.scene.name): functools.partial(_planes, one) for one in reversed(shown.values())}
+    return {"all_scenes": _all_scenes} | planes
+
+
+def _all_scenes(outcome: Outcome) -> tuple[Picture, str, str]:
+    """Draw for each scene which share of its points moves how, by simulator, and which share of gradients is right."""
+    precisions, count = outcome.settings.precisions, len(outcome.scenes)
+    figure, axes = subplots(1, 2, height=1.3 + 0.42 * count, sharey=True, width_ratios=(3, 2))
+    parts = (
+        (axes[0, 0], "motion", (C_MUJOCO, *precisions), Motion, _MOTIONS, "motion"),
+        (axes[0, 1], "derivative", precisions, Derivative, _DERIVATIVES, "gradient, where the motion is fine"),
+    )
+    for axis, what, names, kinds, colours, title in parts:
+        places, found = [], []
+        for i, one in enumerate(outcome.scenes):
+            for j, name in enumerate(names):
+                own = one.found.sel(simulator=name)
+                values = own[what].values[(own.motion < Motion.GAINS_ENERGY).values | (what == "motion")]
+                found.append(np.bincount(values[values >= 0], minlength=len(kinds)))
+                places.append(i + 0.26 * (j - 0.5 * (len(names) - 1)))
+        shares = np.array(found) / np.maximum(np.sum(found, axis=1, keepdims=True), 1)
+        for kind in np.flatnonzero(shares.any(axis=0)):
+            left = shares[:, :kind].sum(axis=1)
+            label = kinds(kind).label if what == "motion" else f"gradient {kinds(kind).label}"
+            axis.barh(places, shares[:, kind], height=0.24, left=left, color=colours[kind], label=label)
+        axis.set(title=title, xlim=(0, 1), xlabel="share of the points")
+        axis.xaxis.set_major_formatter(PercentFormatter(1))
+        axis.grid(visible=False)
+    axes[0, 0].set_yticks(range(count), [one.scene.name for one in outcome.scenes])
+    axes[0, 0].invert_yaxis()
+    handles = [handle for axis in axes[0] for handle in axis.get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    bars = ", ".join((C_MUJOCO, *(f"mjxgrad in {name}" for name in precisions)))
+    caption = (
+        f"Points of stiff and extreme cases, {outcome.settings.num_steps} steps each. Bars of a scene, from above: {bars}; on "
+        "the right mjxgrad alone. Gradients are by the start and judged by central differences in float64. A motion gains energy "
+        f"beyond {GAIN:.0%}."
+    )
+    return figure, "All scenes", caption
 
 
 def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
