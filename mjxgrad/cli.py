@@ -20,49 +20,6 @@ except ImportError:
     print("the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'", file=sys.stderr)
     sys.exit(2)
 
-TEMPLATE = '''\
-"""{name}: controls that move it, found by {estimator} gradients through contact; and their video."""
-
-import functools
-
-import jax
-import jax.numpy as jnp
-import mjxgrad as mg
-import optax
-
-mg.keep_compiled()  # on disk, so that the next run starts at once
-HORIZON, STEPS_PER_KNOT = {horizon}, {per_knot}  # time steps
-scene = mg.load_scene({path!r}{settings})
-
-
-def cost(trajectory):  # yours: here how far the first coordinate comes (m or rad), and what it costs to drive it there
-    return -trajectory.qpos[-1, 0] + 1e-3 * (trajectory.ctrl**2).mean()
-
-
-low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, HORIZON, {contact})
-
-
-def controls(knots):  # between −1 and 1, held for a while each, to the actuators' ranges
-    return jnp.repeat((low + high) / 2 + (high - low) / 2 * jnp.tanh(knots), STEPS_PER_KNOT, axis=0)[:HORIZON]
-
-
-start = jnp.zeros((-(-HORIZON // STEPS_PER_KNOT), scene.model.nu))
-result = mg.optimise(
-    mg.parameter_noise(lambda knots: task.run(controls(knots["knots"])).cost, stddev={stddev}),
-    {{"knots": start}},
-    jax.random.key(0),
-    estimator=functools.partial(mg.estimators.{estimator}, num_samples=16),
-    optimiser=optax.adam(0.1),
-    num_steps=30,
-    log=lambda step, metrics: step % 10 or print(step, metrics["cost"]),
-)
-course = mg.rollout(scene, task.state, controls(result.params["knots"]), contact=task.contact)
-print("cost", cost(course), "from", task.run(controls(start)).cost)
-mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
-'''
-
-
 Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
 
 
@@ -300,25 +257,10 @@ def new(
         raise CommandError(f"{output} exists already; name another --output, or replace it with --force")
     _writable(output)
     verdict = _library().check(_existing(scene), derivatives=False)
-    advice, timestep = verdict.recommendation, verdict.motions.timestep
     if not verdict.scene.model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
-    given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts}
-    settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
-    key = importlib.import_module("mjxgrad.checking.motions").first_keyframe(verdict.scene.mj_model)
-    text = TEMPLATE.format(
-        name=repr(Path(scene).name)[1:-1].replace('"', "'"),  # within a docstring
-        path=str(Path(scene)),
-        settings=settings,
-        keyframe="" if key is None else f", keyframe={key!r}",
-        horizon=min(300, max(50, round(0.5 / (advice.timestep or timestep)))),
-        per_knot=max(1, round(0.05 / (advice.timestep or timestep))),
-        contact=importlib.import_module("mjxgrad.checking.findings").chosen(advice.gradient),
-        estimator=advice.estimator,
-        stddev=advice.stddev,
-        video=str(output.with_suffix(".mp4")),
-    )
-    write(output, text)
+    program = importlib.import_module("mjxgrad.checking.check").program
+    write(output, program(verdict, str(Path(scene)), str(output.with_suffix(".mp4"))))
     print(f"wrote {output}: write your cost into it, then python {output}")
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")

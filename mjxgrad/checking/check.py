@@ -1,6 +1,7 @@
 """One call for a scene of one's own: can it be differentiated, how, and up to which horizon."""
 
 import contextlib
+import dataclasses
 import functools
 import os
 import textwrap
@@ -22,7 +23,7 @@ from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import Finding, Recommendation
 from mjxgrad.checking.measure import Line, Measured, Noise, measure
-from mjxgrad.checking.motions import Motions, Mover, Outcomes, first_keyframe, half_range, most_contacts, random_motions
+from mjxgrad.checking.motions import Motions, Mover, Outcomes, half_range, most_contacts, random_motions
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.engines import QUICK
 from mjxgrad.objective.task import as_pytree, checked_cost
@@ -204,19 +205,17 @@ def check(
 
 def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
     """Yield what the library warned of, without the scene's name; of other libraries' warnings the first of each kind."""
-    own: dict[str, None] = {}
-    by_line: dict[tuple[str, int], set[str]] = {}
+    found: dict[Any, set[str]] = {}
     for one in caught:
+        text = str(one.message)
         if issubclass(one.category, SceneWarning):
-            own[str(one.message).partition(": ")[2]] = None
+            text = text.partition(": ")[2]
+            if "refsafe" not in text and "h²k" not in text:  # a separate finding tells where the time step is too long
+                found[text] = {text}
         elif issubclass(one.category, UserWarning):
-            by_line.setdefault((one.filename, one.lineno), set()).add(str(one.message))
-    # A separate finding tells where the time step is too long.
-    texts = [text for text in own if "refsafe" not in text and "h²k" not in text]
-    for messages in by_line.values():
-        first, *more = sorted(messages)
-        texts.append(first.rstrip(".") + (f" ({len(more)} more alike)" if more else ""))
-    for text in texts:
+            found.setdefault((one.filename, one.lineno), set()).add(text)
+    for first, *more in map(sorted, found.values()):
+        text = first.rstrip(".") + (f" ({len(more)} more alike)" if more else "")
         yield Finding("note", f"{text[:1].upper()}{text[1:]}.")
 
 
@@ -251,37 +250,81 @@ def _noise_text(noise: Noise) -> str:
     return f"Noise {noise.stddev:g}, {where}: {told}"
 
 
-def _code(scene: Scene, advice: Recommendation, path: str) -> str:
-    """Return the recommendation as a program."""
+def _setup(scene: Scene, advice: Recommendation, path: str, more: str = "") -> str:
+    """Return the beginning of a program with the recommended settings, up to its task, with further imports."""
     # On GPUs MJX is faster; elsewhere what compiles nothing.
-    given = {
-        "timestep": advice.timestep,
-        "max_contacts": advice.max_contacts,
-        "engine": QUICK if device.is_cpu() else None,
-    }
+    engine = QUICK if device.is_cpu() else None
+    given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts, "engine": engine}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:
         settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"
-    stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
-    noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
-    key, yours = first_keyframe(scene.mj_model), "  # your file" * (not Path(path).exists())
-    keyframe = "" if key is None else f", keyframe={key!r}"
-    if scene.model.nu:
-        objective, start = f"mg.open_loop(task, stddev={noise})", "jnp.zeros(objective.dim)"
-    else:
-        run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{keyframe})).cost"
-        objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise})"
-        start = f"jnp.zeros({scene.model.nv})"
+    yours, drive = "  # your file" * (not Path(path).exists()), " + 1e-3 * (trajectory.ctrl**2).mean()"
     return f"""\
 import jax
 import jax.numpy as jnp
 import mjxgrad as mg
-
+{more}
 scene = mg.load_scene({path!r}{settings}){yours}
-cost = lambda trajectory: trajectory.qpos[-1, 0]  # yours
-task = mg.SceneTask(scene, mg.initial_state(scene{keyframe}), cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
+cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}  # yours: how far it comes, and drives
+start = mg.initial_state(scene{_keyframe(scene)})
+task = mg.SceneTask(scene, start, cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
+"""
+
+
+def _keyframe(scene: Scene) -> str:
+    model = scene.mj_model
+    return f", keyframe={model.key(0).name or 0!r}" if model.nkey else ""
+
+
+def _code(scene: Scene, advice: Recommendation, path: str) -> str:
+    """Return the recommendation as a program."""
+    stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
+    noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
+    objective = f"mg.open_loop(task, stddev={noise})"
+    if not scene.model.nu:
+        run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{_keyframe(scene)})).cost"
+        objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise}, dim={scene.model.nv})"
+    return f"""\
+{_setup(scene, advice, path)}\
 objective = {objective}
-estimate = mg.estimators.{advice.estimator}(objective, {start}, jax.random.key(0), num_samples=32)
+params = jnp.zeros(objective.dim)
+estimate = mg.estimators.{advice.estimator}(objective, params, jax.random.key(0), num_samples=32)
+"""
+
+
+def program(verdict: Verdict, path: str, video: str) -> str:
+    """Return a program that optimises a motion of a scene with actuators by the recommended settings, and films it."""
+    advice = verdict.recommendation
+    timestep = advice.timestep or verdict.motions.timestep
+    horizon, held = min(300, max(50, round(0.5 / timestep))), max(1, round(0.05 / timestep))
+    more = "import optax\n\nmg.keep_compiled()  # on disk, so that the next run starts at once"
+    name = repr(Path(path).name)[1:-1].replace('"', "'")  # within a docstring
+    return f"""\
+\"\"\"{name}: controls that move it, found by {advice.estimator} gradients through contact; and their video.\"\"\"
+
+import functools
+
+{_setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, more)}
+low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
+
+
+def controls(knots):  # between −1 and 1, held for {held} time steps each, to the actuators' ranges
+    return jnp.repeat((low + high) / 2 + (high - low) / 2 * jnp.tanh(knots), {held}, axis=0)[: task.horizon]
+
+
+knots = jnp.zeros(({-(-horizon // held)}, scene.model.nu))
+result = mg.optimise(
+    mg.parameter_noise(lambda params: task.run(controls(params["knots"])).cost, stddev={advice.stddev}),
+    {{"knots": knots}},
+    jax.random.key(0),
+    estimator=functools.partial(mg.estimators.{advice.estimator}, num_samples=16),
+    optimiser=optax.adam(0.1),
+    num_steps=30,
+    log=lambda step, metrics: step % 10 or print(step, metrics["cost"]),
+)
+course = mg.rollout(scene, start, controls(result.params["knots"]), contact=task.contact)
+print("cost", cost(course), "from", task.run(controls(knots)).cost)
+mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
 """
 
 
