@@ -129,6 +129,8 @@ def measure(
     # In order of importance, since the last are left out where time is short: a line, noise, then the others.
     asked.insert(1, asked.pop(_NUM_LINES))
     found, left_out, end = [], [], mover.end
+    of_kind = lambda kind: tuple(one for one in found if isinstance(one, kind))  # noqa: E731
+    so_far = lambda: Measured(np.array(lengths) * motions.timestep, of_kind(Line), of_kind(Noise), tuple(left_out))  # noqa: E731
     # One after the other: two at once deadlocked on dm_control's humanoid (two cores, jax 0.10.2).
     for words, num_batches, task in asked:
         # A verdict without a line is useless: the first one may take twice the remaining time.
@@ -140,19 +142,14 @@ def measure(
                 raise TimeoutError
             found.append(task())
             if is_first:
-                first(Measured(np.array(lengths) * motions.timestep, tuple(found), ()))
+                first(so_far())
         except TimeoutError:
             left_out.append(words)
         except KeyboardInterrupt:
             log("interrupted: the verdict is of what was measured")
             left_out.append(words)
             end = 0.0
-    return Measured(
-        np.array(lengths) * motions.timestep,
-        tuple(one for one in found if isinstance(one, Line)),
-        tuple(one for one in found if isinstance(one, Noise)),
-        tuple(left_out),
-    )
+    return so_far()
 
 
 def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
@@ -181,7 +178,7 @@ def _direction(
     Its length moves the first touch through several steps, so that it meets the teeth of MuJoCo's motion.
     """
     model, timestep = scene.model, float(scene.model.opt.timestep)
-    units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, num_steps * timestep)
+    units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, timestep)
     sizes = _TEETH * timestep * speed, _SPEED_SHARE * speed, _CONTROL_SHARE * half_range(scene)
     both = zip(sizes, units, strict=True)
     parts = [size * unit / np.sqrt((unit**2).mean()) if unit.size else unit for size, unit in both]
@@ -262,8 +259,8 @@ class _Probe:
         size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)
         has_controls = self.scene.model.nu > 0
         still = np.zeros(state.qvel.size)
-        seconds = steps * self.motions.timestep
-        wiggle = smooth(rng, steps, len(half), seconds) if has_controls else rng.normal(size=(1, still.size))
+        timestep = self.motions.timestep
+        wiggle = smooth(rng, steps, len(half), timestep) if has_controls else rng.normal(size=(1, still.size))
         along = wiggle / np.sqrt((wiggle**2).sum())
         noise = stddev * rng.normal(size=(size, *along.shape))
         states = _repeated(state, size)
@@ -278,7 +275,7 @@ class _Probe:
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
         first, zeroth = estimates(found.outcomes, found.derivatives, scores[:, :, None])
-        times = np.array(self.lengths) * self.motions.timestep
+        times = np.array(self.lengths) * timestep
         return Noise(stddev, stiffness, first, zeroth, crossover(times, first, zeroth))
 
 

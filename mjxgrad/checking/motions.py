@@ -30,7 +30,7 @@ from mjxgrad.rollouts import State, Trajectory
 from mjxgrad.rollouts.start import pose_warnings
 from mjxgrad.scene import Scene
 from mjxgrad.scene.refusals import element_name
-from mjxgrad.scene.scene import numbers_of
+from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
 
 _NUM_MOTIONS = 4
@@ -91,9 +91,11 @@ def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
     return np.where(scene.mj_model.actuator_ctrllimited & (high > low), (high - low) / 2, 1.0)
 
 
-def smooth(rng: np.random.Generator, num_steps: int, num_columns: int, seconds: float) -> Float[np.ndarray, "steps nu"]:
+def smooth(
+    rng: np.random.Generator, num_steps: int, num_columns: int, timestep: float
+) -> Float[np.ndarray, "steps nu"]:
     """Draw numbers between −1 and 1 that are piecewise linear in time between a few random knots."""
-    knots = rng.uniform(-1, 1, (max(2, round(_KNOTS_PER_SECOND * seconds) + 1), num_columns))
+    knots = rng.uniform(-1, 1, (max(2, round(_KNOTS_PER_SECOND * num_steps * timestep) + 1), num_columns))
     return scipy.interpolate.make_interp_spline(np.linspace(0, 1, len(knots)), knots, k=1)(np.linspace(0, 1, num_steps))
 
 
@@ -105,7 +107,7 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
     middle, half = np.where(np.isfinite(low + high), (low + high) / 2, 0.0), half_range(scene)
     starts = list(_starts(scene, model))
     chosen = [starts[i % len(starts)] for i in range(_NUM_MOTIONS)]
-    wiggles = [smooth(rng, num_steps, model.nu, num_steps * timestep) for _ in chosen]
+    wiggles = [smooth(rng, num_steps, model.nu, timestep) for _ in chosen]
     controls = np.array([middle + _REACH * half * one for one in wiggles])
     names, *parts = zip(*chosen, strict=True)
     start: _States = dict(zip(("qpos", "qvel", "act"), map(np.array, parts), strict=True))
@@ -126,11 +128,6 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
     )
 
 
-def first_keyframe(model: mujoco.MjModel) -> str | int | None:
-    """Return the name or else the number of a scene's first key frame; None if it has none."""
-    return (model.key(0).name or 0) if model.nkey else None
-
-
 def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Yield name and state of the key frames, and of the reference pose if it is valid or the only one."""
     for i in range(min(model.nkey, _NUM_MOTIONS - 1)):
@@ -138,6 +135,11 @@ def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarr
         yield f"key frame {name}", model.key_qpos[i], model.key_qvel[i], model.key_act[i]
     if not model.nkey or not any(pose_warnings(scene.model, model, model.qpos0)):
         yield "the reference pose", model.qpos0, np.zeros(model.nv), np.zeros(model.na)
+
+
+def start_of(state: State) -> _States:
+    """Return the parts of one or more states from which C MuJoCo starts."""
+    return {name: np.asarray(getattr(state, name), float) for name in ("qpos", "qvel", "act")}
 
 
 def run(
@@ -153,9 +155,10 @@ def run(
 
     With `follow`, a kind of derivative and changes of start and controls, "change" is what becomes of these after each step.
     """
-    model = scene.model if softness is None else softness.apply(scene.model)
-    numbers = {name: np.asarray(value)[None] for name, value in numbers_of(model).items()}
-    numbers["opt.timestep"] = numbers["opt.timestep"] / refined
+    if softness is not None:
+        scene = dataclasses.replace(scene, model=softness.apply(scene.model))
+    numbers = changed_numbers(scene) | {"opt.timestep": scene.model.opt.timestep / refined}
+    numbers = {name: np.asarray(value)[None] for name, value in numbers.items()}
     given = numbers, {"time": np.zeros((len(controls), 1)), **start}, {"ctrl": np.repeat(controls, refined, axis=1)}
     pool = pool_of(scene.mj_model)
     found = pool.run(*given) if follow is None else pool.follow(follow[0], *given, follow[1])
@@ -220,7 +223,7 @@ def _approach(model: mujoco.MjModel, data: mujoco.MjData, contact) -> float:
 
 def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"], refined: int = 1) -> frozenset[str]:
     """Return the pairs that touch at any time of a motion by C MuJoCo, at a time step divided by `refined`."""
-    start = {name: np.asarray(getattr(state, name), float)[None] for name in ("qpos", "qvel", "act")}
+    start = {name: x[None] for name, x in start_of(state).items()}
     path, _ = held(run(scene, start, controls[None], refined=refined))
     touches, touching, _ = _touches(scene.to_mujoco(), path["qpos"], path["qvel"])
     return frozenset([touch.pair for touch in touches]) | frozenset(touching)
@@ -303,7 +306,7 @@ class Mover:
         """
         if time.perf_counter() > self.end:
             raise TimeoutError
-        start = {k: np.asarray(getattr(states, k), float) for k in ("qpos", "qvel", "act")}
+        start = start_of(states)
         num, steps = len(controls), lengths[-1]
         controls = np.asarray(controls, float)[:, :steps]
         pushes = np.broadcast_to(direction.controls[:steps], controls.shape)

@@ -303,26 +303,26 @@ def sweep(
         progress=None if log is None else lambda done, total: log(f"{done} of {total} stiffnesses"),
     )
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
-    question = f"Gradient of {called} after {task.horizon} steps, by {knob}."
-    told = (
-        "Swept contacts are critically damped" if scene.pairs else "No two geoms can touch, so stiffness has no effect"
-    )
-    question += f" {told}."
-    contact, who = task.contact, engine_of(task.scene, task.contact).title
+    contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
     kinds = {"slope": "the slope of the outcome", "discrete": "that of each step"}
     kind = kinds.get(getattr(contact, "gradient", ""), f"{contact}")
-    question += f" Derivative: {kind}, by {who}."
-    shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
+    told = [
+        f"Gradient of {called} after {task.horizon} steps, by {knob}.",
+        "Swept contacts are critically damped."
+        if scene.pairs
+        else "No two geoms can touch, so stiffness has no effect.",
+        f"Derivative: {kind}, by {engine_of(task.scene, contact).title}.",
+    ]
     if isinstance(contact, Slope) and scene.pairs and swept[-1] >= shortest:
-        told = "on contacts last at most three time steps, and the slope is off, most by MJX: shorten the time step"
-        question += f" From {format_number(float(f'{shortest:.1g}'))} 1/s² {told}."
+        short = "on contacts last at most three time steps, and the slope is off, most by MJX: shorten the time step"
+        told.append(f"From {format_number(float(f'{shortest:.1g}'))} 1/s² {short}.")
     table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
     if len(result.cost) and not np.isfinite(table["truth"]).any():
         raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
     if left_out := len(swept) - len(result.cost):
-        question += f" Interrupted: {left_out} of {len(swept)} stiffnesses are left out."
+        told.append(f"Interrupted: {left_out} of {len(swept)} stiffnesses are left out.")
     if row < len(result.cost) and table["zeroth_variance"][row, 0] > 0:
         ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
         ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
-        question += f" Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}."
-    return Sweep(scene.name, question, knob.own, result)
+        told.append(f"Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}.")
+    return Sweep(scene.name, " ".join(told), knob.own, result)

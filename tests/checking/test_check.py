@@ -17,7 +17,17 @@ from mjxgrad.checking import findings
 from mjxgrad.checking.check import _warned, telling
 from mjxgrad.checking.findings import left_out_findings, measured_findings, recommend, slopes
 from mjxgrad.checking.measure import Line, Measured, crossover, estimates, measure
-from mjxgrad.checking.motions import KINDS, REFINED, Direction, Moved, Mover, most_contacts, random_motions
+from mjxgrad.checking.motions import (
+    KINDS,
+    REFINED,
+    Direction,
+    Moved,
+    Mover,
+    most_contacts,
+    random_motions,
+    run,
+    start_of,
+)
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
@@ -300,6 +310,16 @@ def test_a_fine_motion_is_that_of_a_shorter_time_step():
         start = mg.initial_state(scene, qvel=np.array([speed]))
         course = mg.rollout(scene.with_engine("mujoco"), start, horizon=20 * REFINED)
         np.testing.assert_allclose(found[-1], [course.qpos[-1, 0], course.qvel[-1, 0]], rtol=1e-6)
+
+
+def test_numbers_that_c_mujoco_alone_has_move_its_motions():
+    """A ball falls through honey: by the rollout of the same scene, and otherwise than through nothing."""
+    scene = mg.load_scene(ball(height=0.6)).with_engine("mujoco")
+    start, controls = start_of(jax.tree.map(lambda x: x[None], mg.initial_state(scene))), np.zeros((1, 50, 1))
+    thick = scene.with_model(viscosity=2.0)
+    free, found = (run(one, start, controls)["qvel"][0] for one in (scene, thick))
+    np.testing.assert_allclose(found, mg.rollout(thick, mg.initial_state(thick), controls[0]).qvel, rtol=1e-12)
+    assert free[-1, 0] < 1.1 * found[-1, 0] < 0
 
 
 def test_hit_or_miss_is_named_with_its_pair(wall):
