@@ -185,8 +185,55 @@ _SMALLEST, _LARGEST = 1e-9, 10.0
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name a figure per scene."""
-    return {course.name: functools.partial(_drawn, course) for course in outcome.courses}
+    """Name a figure of all scenes, and one per scene."""
+    return {"all_scenes": _all_scenes} | {course.name: functools.partial(_drawn, course) for course in outcome.courses}
+
+
+def _all_scenes(outcome: Outcome):
+    """Draw the least time to each error, scene by scene: of the motion on the left, of the gradient on the right."""
+    targets, count = sorted(outcome.settings.targets, reverse=True), len(outcome.courses)
+    figure, axes = subplots(1, 2, height=1.6 + 0.4 * count, sharey=True)
+    ways = dict.fromkeys(one.estimator for course in outcome.courses for one in course.estimates)
+    for i, course in enumerate(outcome.courses):
+        for axis, names, markers, shift in (
+            (axes[0, 0], (MG, MJX, C), "oDs", 0.22),
+            (axes[0, 1], ways, "osD^vP", 0.18),
+        ):
+            for j, (name, marker) in enumerate(zip(names, markers, strict=False)):
+                is_motion = axis is axes[0, 0]
+                found = [_least(course, name, target, is_motion=is_motion) for target in targets]
+                place = i + shift * (j - 0.5 * (len(names) - 1))
+                colour = _COLOURS[name] if is_motion else _ESTIMATORS[name]
+                axis.plot(found, [place] * len(found), "-", color=colour, lw=1.2)
+                look = {"marker": marker, "color": colour, "ls": ""}
+                axis.plot(found[0], place, ms=6, label="_" if i else name, **look)
+                axis.plot(found[1:], [place] * len(found[1:]), ms=4, mfc="white", **look)
+    for axis, title, side in zip(axes[0], ("motion", "gradient"), ("left", "right"), strict=True):
+        what = "second of motion and state" if title == "motion" else "estimate"
+        axis.set(title=f"time to an error of the {title}", xscale="log", xlabel=f"seconds per {what}")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        figure.legend(*axis.get_legend_handles_labels(), fontsize=8, loc=f"outside lower {side}", ncols=3)
+    axes[0, 0].set_ylim(-0.6, count - 0.4)
+    axes[0, 0].set_yticks(range(count), [course.title for course in outcome.courses])
+    axes[0, 0].invert_yaxis()
+    shown = " and ".join(
+        f"{shape} {percent(target)}" for shape, target in zip(("full", "hollow"), targets, strict=False)
+    )
+    caption = (
+        f"The least wall time to an error, {shown}, over all rules of integration, precisions and time steps; where a mark is "
+        "missing, nothing that was tried gets there, or the reference is not known so well. Left is better. Gradients take as "
+        "many rollouts as their bias and variance call for."
+    )
+    return figure, "All scenes", caption
+
+
+def _least(course: Course, name: str, target: float, *, is_motion: bool) -> float:
+    """Return the least seconds by a library, or by a way of estimating, to an error; NaN if it is not reached."""
+    if is_motion:
+        point = _best(course, name, target)
+        return np.nan if point is None else point.cost
+    choice = cheapest([one for one in course.estimates if one.estimator == name], target)
+    return np.nan if choice is None else choice.seconds
 
 
 def _drawn(course: Course, outcome: Outcome):
