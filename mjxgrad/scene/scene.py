@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._arrays import instance, is_known, real
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
-from mjxgrad.bodies import constants
+from mjxgrad.bodies import constants, tree
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
@@ -216,6 +216,7 @@ class Scene(eqx.Module):
             _contacts(self),
             _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),
+            _table("Left out by rollouts", list(_left_out(self))),
             _table("Unlike C MuJoCo", [(text,) for text in unlike]),
             _table("Warnings", [(text,) for text in self.warnings()]),
         ]
@@ -302,6 +303,33 @@ def _contacts(scene: Scene) -> str:
         legend += "\n  all of them: scene.pairs"
     heads = [("pair", *(name for name, _, _ in columns)), ("", *(unit for _, unit, _ in columns))]
     return _table(title, heads + rows, is_numeric=True) + f"\n  {legend}"
+
+
+def _left_out(scene: Scene) -> Iterator[tuple[str, str]]:
+    """Yield what a rollout neither computes nor keeps, whatever was loaded, and why."""
+    model = scene.mj_model
+    if scene.engine == "mujoco":
+        # As `engines.inverse.has_inverse`, which knows of scenes.
+        is_staged = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        if not (is_staged or model.opt.noslip_iterations or model.nhistory or model.nplugin):
+            yield "kinematics, collisions", "derivatives by velocities, accelerations and controls do not need them"
+            yield "geoms that do not touch", "differences by positions do not bring them together"
+            yield "the solver", "derivatives are those of the solution that a step has found"
+        yield "numbers of the model", "a call passes those alone that differ from the file's"
+        return
+    size, every = model.nq + 2 * model.nv + model.na + 1, sum(np.size(x) for x in jax.tree.leaves(scene.data))
+    yield "data between steps", f"a rollout carries {size} of {every} numbers; observe= keeps more"
+    yield "values within steps", "a gradient computes them anew; checkpoint=False keeps them"
+    kinds = ((model.nsensor, "sensors"), (model.ncam, "cameras"), (model.nlight, "lights"))
+    if unread := [name for count, name in kinds if count]:
+        yield ", ".join(unread), "they move nothing; computed only where observe= reads them"
+    if scene.data._impl.nefc and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_WARMSTART:
+        yield "unconstrained acceleration", "a solve starts at the last acceleration alone"
+    geoms = np.array([(pair.geom1, pair.geom2) for pair in scene.pairs], int).reshape(-1, 2)
+    moves = tree.moving_dofs(scene.model)[model.geom_bodyid[geoms]]
+    zeros = int((moves[:, 0] == moves[:, 1]).sum())
+    if zeros and scene.data._impl.ncon == sum(map(len, candidates(scene.model).values())):
+        yield "columns of contacts", f"{zeros} of {len(geoms) * model.nv}: these joints do not move the geoms apart"
 
 
 def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:

@@ -55,6 +55,31 @@ def test_conversions_omissions_and_reasons_are_shown(scene):
         assert entry.reason in text
 
 
+def test_what_rollouts_leave_out_is_shown_by_the_engine(scene):
+    """The ball has 7 positions, 6 velocities and as many accelerations; time is one number more.
+
+    Of 2 contacts × 6 velocities none moves both sides or neither.
+    """
+    by_mjx, by_c = scene.summary(), scene.with_engine("mujoco").summary()
+    assert "a rollout carries 20 of" in by_mjx
+    assert "lights" in by_mjx
+    assert "columns of contacts" not in by_mjx
+    assert "derivatives are those of the solution" in by_c
+    assert "a rollout carries" not in by_c
+
+
+def test_zero_columns_of_contacts_are_counted():
+    """A ball and a pendulum over a floor: 6, 1 and 6 + 1 of 7 columns move the floor and each, and each other."""
+    bodies = "<body pos='0 0 1'><freejoint/><geom size='.1'/></body><body pos='2 0 1'><joint/><geom pos='.3 0 0' size='.1'/></body>"
+    text = load_scene(f"<mujoco><worldbody><geom type='plane' size='1 1 1'/>{bodies}</worldbody></mujoco>").summary()
+    assert "7 of 21: these joints" in text
+
+
+def test_nothing_of_runge_kutta_derivatives_is_left_out():
+    rk4 = load_scene(BALL_WALL.replace("<option ", "<option integrator='RK4' ")).with_engine("mujoco").summary()
+    assert "derivatives are those of the solution" not in rk4
+
+
 def test_warnings_are_shown(scene):
     with pytest.warns(UserWarning, match="stable below 4"):
         stiff = scene.with_softness(Softness(stiffness=1e8, damping_ratio=1))
