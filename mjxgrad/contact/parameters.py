@@ -11,7 +11,10 @@ References:
     MuJoCo documentation, "Solver parameters" and "Contact parameters".
 """
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,11 +22,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._mjx import geom_pairs, mjx
+from mjxgrad._mjx import contact_groups, geom_groups, geom_pairs, mjx
 from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.contact.law import rest_depth, stiffness_damping
 
 _DISABLES_CONTACT = mujoco.mjtDisableBit.mjDSBL_CONTACT.value | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value
+# Data for MJX's contacts before they are found: of it, only the slots are copied.
+_NOWHERE = SimpleNamespace(_impl=SimpleNamespace(contact=SimpleNamespace(dim=None, efc_address=None)))
 
 
 @dataclass(frozen=True)
@@ -130,10 +135,8 @@ def named_pairs(pairs: Pairs, wanted: tuple[tuple[str, str], ...], what: str) ->
     known = {frozenset(pair.names) for pair in pairs}
     for names in wanted:
         if frozenset(names) not in known:
-            listed = ", ".join(map(str, pairs[:20])) + (" ..." if len(pairs) > 20 else "")
-            raise ValueError(
-                f"{what} must name pairs of geoms that can touch, got {names!r}; those that can: {listed or 'none'}"
-            )
+            listed = ", ".join(map(str, pairs[:20])) + " ..." * (len(pairs) > 20) or "none"
+            raise ValueError(f"{what} must name pairs of geoms that can touch, got {names!r}; those that can: {listed}")
     return tuple(pair for pair in pairs if frozenset(pair.names) in set(map(frozenset, wanted)))
 
 
@@ -154,7 +157,7 @@ def contact_parameters(model: mjx.Model, pairs: Pairs) -> ContactParameters:
 
     Differentiable with respect to the model's leaves, and traceable.
     """
-    solref, solimp, friction, margin = _mix(model, pairs)
+    solref, solimp, friction, margin = _mixed(model, pairs)
     stiffness, damping = stiffness_damping(model, solref)
     return ContactParameters(
         stiffness=stiffness,
@@ -178,41 +181,13 @@ def _pyramid_factor(model: mjx.Model, pairs: Pairs, friction: Array) -> Array:
     return jnp.where(condim > 1, factor, 1.0)
 
 
-def _mix(model: mjx.Model, pairs: Pairs) -> tuple[Array, ...]:
-    """Combine the parameters of two geoms by MuJoCo's rules."""
-    numbers = [(pair.geom1, pair.geom2, pair.explicit) for pair in pairs]
-    geom1, geom2, explicit = np.array(numbers, dtype=int).reshape(-1, 3).T
-    weight = _mix_weight(model, geom1, geom2)[:, None]
-    solref1, solref2 = model.geom_solref[geom1], model.geom_solref[geom2]
-    both_standard = (solref1[:, :1] > 0) & (solref2[:, :1] > 0)
-    # Numbers of the direct format are negative, so the smaller one is stiffer.
-    solref = jnp.where(both_standard, weight * solref1 + (1 - weight) * solref2, jnp.minimum(solref1, solref2))
-    solimp = weight * model.geom_solimp[geom1] + (1 - weight) * model.geom_solimp[geom2]
-    friction = jnp.maximum(model.geom_friction[geom1], model.geom_friction[geom2])
-
-    priority1, priority2 = model.geom_priority[geom1], model.geom_priority[geom2]
-    winner = np.where(priority1 > priority2, geom1, geom2)
-    has_winner = (priority1 != priority2)[:, None]
-    solref = jnp.where(has_winner, model.geom_solref[winner], solref)
-    solimp = jnp.where(has_winner, model.geom_solimp[winner], solimp)
-    friction = jnp.where(has_winner, model.geom_friction[winner], friction)[:, [0, 0, 1, 2, 2]]
-    margin = model.geom_margin[geom1] + model.geom_margin[geom2]
-
-    if not (explicit >= 0).any():
-        return solref, solimp, friction, margin
-    is_explicit = (explicit >= 0)[:, None]
-    return (
-        jnp.where(is_explicit, model.pair_solref[explicit], solref),
-        jnp.where(is_explicit, model.pair_solimp[explicit], solimp),
-        jnp.where(is_explicit, model.pair_friction[explicit], friction),
-        jnp.where(is_explicit[:, 0], model.pair_margin[explicit], margin),
-    )
-
-
-def _mix_weight(model: mjx.Model, geom1: np.ndarray, geom2: np.ndarray) -> Array:
-    """Return the weight of the first geom: its share of `solmix`, one half if both are zero."""
-    solmix1, solmix2 = model.geom_solmix[geom1], model.geom_solmix[geom2]
-    smallest = mujoco.mjMINVAL
-    neither = (solmix1 < smallest) & (solmix2 < smallest)
-    total = jnp.where(neither, 1.0, solmix1 + solmix2)
-    return jnp.select([neither, solmix1 < smallest, solmix2 < smallest], [0.5, 0.0, 1.0], solmix1 / total)
+def _mixed(model: mjx.Model, pairs: Pairs) -> Iterator[Array]:
+    """Yield `solref`, `solimp`, friction and margin of pairs, as MJX's contacts have them."""
+    model = model.replace(geom_solmix=jnp.maximum(model.geom_solmix, mujoco.mjMINVAL))  # no quotient of zeros
+    groups = contact_groups(model, _NOWHERE) if pairs else {}  # pyright: ignore[reportArgumentType]
+    every = itertools.chain.from_iterable(geom_groups(model).values())
+    places = {tuple(map(int, one)): place for place, one in enumerate(every)}
+    index = np.array([places[pair.geom1, pair.geom2, pair.explicit] for pair in pairs], int)
+    for name, shape in (("solref", (0, 2)), ("solimp", (0, 5)), ("friction", (0, 5)), ("includemargin", (0,))):
+        of_groups = [getattr(contact, name) for contact in groups.values()]
+        yield jnp.concatenate([jnp.zeros(shape, model.geom_solref.dtype), *of_groups])[index]
