@@ -92,11 +92,8 @@ def over_devices(function: Callable[..., Any], *, num_shared: int = 0) -> Callab
         specs = [jax.sharding.PartitionSpec(*() if i < num_whole else ("batch",)) for i in range(len(leaves))]
         # XLA's partitioner crashes on empty inputs that are used (jax 0.11.2), so each device makes its own. Under `jax.jit`
         # the arrays that the function closes over are no inputs.
-        empty = {
-            i: x.shape if i < num_whole else (size // len(own), *x.shape[1:])
-            for i, x in enumerate(leaves)
-            if not np.size(x)
-        }
+        part_of = lambda i, x: x.shape if i < num_whole else (size // len(own), *x.shape[1:])  # noqa: E731
+        empty = {i: part_of(i, x) for i, x in enumerate(leaves) if not np.size(x)}
 
         def of_part(given: list[Any]) -> Any:
             numbers = iter(given)

@@ -266,9 +266,7 @@ def _linear_by_slices(x: Array, *, matrix: _Matrix, batch: int) -> Array:
     none = jnp.zeros_like(items[0])
 
     def row(weights: np.ndarray) -> Array:
-        terms = [
-            items[k] if weights[k] == 1 else float(weights[k]) * items[k] for k in np.flatnonzero(weights).tolist()
-        ]
+        terms = [items[k] if (w := float(weights[k])) == 1 else w * items[k] for k in np.flatnonzero(weights).tolist()]
         return add(terms or [none])
 
     rows, place = np.unique(matrix.entries, axis=0, return_inverse=True)
@@ -319,18 +317,15 @@ def _gathered(x: Array, rows: np.ndarray, batch: int) -> Array:
     return _where_terms(add(layers), is_term.any(axis=1).reshape(along))
 
 
+def _linear_shape(x, *, matrix, batch):
+    return jax.core.ShapedArray((*x.shape[:batch], len(matrix.entries), *x.shape[batch + 1 :]), x.dtype)
+
+
 def _transpose_linear(cotangent, x, *, matrix, batch):
     return (_linear.bind(cotangent, matrix=_constant(matrix.entries.T), batch=batch),)
 
 
-_linear = _define(
-    "linear",
-    lambda x, *, matrix, batch: jax.core.ShapedArray(
-        (*x.shape[:batch], len(matrix.entries), *x.shape[batch + 1 :]), x.dtype
-    ),
-    _linear_by_slices,
-    _linear_by_gathers,
-)
+_linear = _define("linear", _linear_shape, _linear_by_slices, _linear_by_gathers)
 ad.deflinear2(_linear, _transpose_linear)
 
 

@@ -110,16 +110,10 @@ def run(
     def of_one(x) -> pallas.BlockSpec:
         return pallas.BlockSpec((None, *x.shape[1:]), lambda state: (state, *(0,) * (len(x.shape) - 1)))
 
-    found = pallas.pallas_call(
-        kernel,
-        out_shape=shapes,
-        in_specs=[of_one(x) for x in inputs],
-        out_specs=[of_one(x) for x in shapes],
-        grid=(len(inputs[0]),),
-        compiler_params=triton.CompilerParams(num_warps=num_warps, num_stages=1),
-        interpret=interpret,
-    )(*inputs)
-    return [jnp.moveaxis(x, 0, -1) for x in found]
+    how: Any = {"in_specs": [of_one(x) for x in inputs], "out_specs": [of_one(x) for x in shapes]}
+    how |= {"compiler_params": triton.CompilerParams(num_warps=num_warps, num_stages=1), "interpret": interpret}
+    call = pallas.pallas_call(kernel, out_shape=shapes, grid=(len(inputs[0]),), **how)
+    return [jnp.moveaxis(x, 0, -1) for x in call(*inputs)]
 
 
 def _padded_to(x: Float[Array, "*shape batch"], shape: Sequence[int]) -> Array:

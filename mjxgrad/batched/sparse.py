@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +13,7 @@ from jaxtyping import Array, Bool, PyTree
 _PARTS, _LEAST = 8, 8
 
 
-def sparsely(
-    function: Callable[[Any, Any], PyTree], is_wanted: Bool[Array, " n"], each: PyTree, common: PyTree
-) -> PyTree:
+def sparsely(function: Callable, is_wanted: Bool[Array, " n"], each: PyTree, common: PyTree) -> PyTree:
     """Return a function of each of n things where it is wanted, and zeros elsewhere.
 
     Under `jax.vmap` the wanted ones of the whole batch are gathered, so that time goes with their number.
@@ -58,11 +55,8 @@ def _gathered(function: Callable, kinds: list[str]) -> Callable:
         def part(first: Array) -> tuple[Array, PyTree]:
             index = jax.lax.dynamic_slice(order, (first,), (size,))
             places = {"each": index, "group": index // (count // groups)}
-            taken = [
-                x if kind == "common" else x.at[places[kind]].get(mode="clip")
-                for x, kind in zip(leaves, kinds, strict=True)
-            ]
-            return index, own(*taken)
+            both = zip(leaves, kinds, strict=True)
+            return index, own(*(x if kind == "common" else x.at[places[kind]].get(mode="clip") for x, kind in both))
 
         def go_on(state: tuple) -> tuple:
             first, found = state
@@ -78,9 +72,8 @@ def _gathered(function: Callable, kinds: list[str]) -> Callable:
     def _(
         size: int, is_batched: Sequence[bool], is_wanted: Array | np.ndarray, *leaves: Array | np.ndarray
     ) -> tuple[PyTree, PyTree]:
-        groups = next(
-            (jnp.shape(x)[b] for x, kind, b in zip(leaves, kinds, is_batched[1:], strict=True) if kind == "group"), 1
-        )
+        every = zip(leaves, kinds, is_batched[1:], strict=True)
+        groups = next((jnp.shape(x)[batched] for x, kind, batched in every if kind == "group"), 1)
         flat, after = [], []
         for x, kind, batched in zip((is_wanted, *leaves), ["each", *kinds], is_batched, strict=True):
             if kind == "common" and not batched:

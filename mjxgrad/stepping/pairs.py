@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad._arrays import with_derivative_of
 from mjxgrad._mjx import mjx
-from mjxgrad.batched import cholesky, symmetric
+from mjxgrad.batched import cholesky, linear
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.batched.maps import safe_norm
 from mjxgrad.batched.sparse import sparsely
@@ -328,7 +328,7 @@ class _Step:
         same = (shares[:, None] & shares).any(axis=2) | np.eye(count, dtype=bool)
         for _ in range(math.ceil(math.log2(count))):
             same = (same[:, :, None] & same).any(axis=1)
-        squares, left = symmetric.eigh(jnp.where(same, own @ own.T, 0.0))
+        squares, left = linear.eigh(jnp.where(same, own @ own.T, 0.0))
         largest = jnp.max(jnp.abs(left), axis=0)
         group = same[jnp.argmax(jnp.abs(left), axis=0)] & is_event  # of each mode
         is_one = largest * jnp.sqrt(jnp.maximum(squares, 0.0)) > 1 / slope.FARTHEST

@@ -1,10 +1,10 @@
-"""Eigenvectors of small symmetric matrices."""
+"""Eigenvectors of small symmetric matrices, by rotations."""
 
 import jax
 import numpy as np
 import pytest
 
-from mjxgrad.batched import symmetric
+from mjxgrad.batched import linear
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
@@ -18,7 +18,7 @@ def test_any_small_matrix_is_taken_apart(size: int, precision: type):
     matrices = (factors @ factors.transpose(0, 2, 1)).astype(precision)
     matrices[100:120] = np.eye(size)
     matrices[120:140] *= np.eye(size)
-    values, vectors = (np.asarray(x, float) for x in jax.jit(jax.vmap(symmetric.eigh))(matrices))
+    values, vectors = (np.asarray(x, float) for x in jax.jit(jax.vmap(linear.eigh))(matrices))
     largest = np.abs(matrices).max(axis=(1, 2)) + 1e-30
     rounding = 20 * np.finfo(precision).eps  # a rotation for each pair and sweep
     off = np.abs((vectors * values[:, None]) @ vectors.transpose(0, 2, 1) - matrices).max(axis=(1, 2)) / largest
