@@ -23,7 +23,7 @@ from mjxgrad.planning.system import (
     stage_model,
     terminal_model,
 )
-from mjxgrad.rollouts.arguments import sequence_of
+from mjxgrad.rollouts.rollout import sequence_of
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]

@@ -1,16 +1,20 @@
-"""Rollouts of a scene: its arguments are checked here, and its engine steps it."""
+"""Rollouts of a scene, and linear models of its steps: arguments are checked here, and its engine steps it."""
 
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Float, PyTree
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import function, instance
+from mjxgrad._arrays import function, instance, known, real, whole
 from mjxgrad.engines import Motion, Observe, Policy, Rows, Sees, State, Trajectory, engine_of
-from mjxgrad.rollouts import arguments
+from mjxgrad.engines.layout import INPUTS
+from mjxgrad.engines.state import check_scene
 from mjxgrad.scene import Scene, SceneWarning
-from mjxgrad.stepping import Contact, Discrete, Smoothing, smoothing_warnings
+from mjxgrad.stepping import Contact, Discrete, Slope, Smoothing, smoothing_warnings
 
 
 def rollout(
@@ -62,7 +66,7 @@ def rollout(
         ValueError: if contact is none of the four records, shapes do not fit the scene, the horizon is missing or contradicted,
             or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as diverged at this step).
     """
-    arguments.check_start(scene, state)
+    check_start(scene, state)
     engine = engine_of(scene, contact)
     for message in smoothing_warnings(scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
@@ -74,10 +78,102 @@ def rollout(
     function("policy", policy, "params", "state")
     if policy is None and params is not None:
         raise ValueError("params must belong to a policy, got them beside a sequence of controls: give noise as noise=")
-    sequence, horizon = arguments.sequence_of(controls, noise, horizon, scene.model.nu)
-    forces = arguments.applied(scene, inputs, horizon)
+    sequence, horizon = sequence_of(controls, noise, horizon, scene.model.nu)
+    forces = applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     rows = Rows(base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     ways = (policy_sees, checkpoint, contact, measure_growth)
     motion = Motion(scene, policy, params if policy is not None else None, observe, *ways)
     return engine.roll_out(motion, state, rows)
+
+
+class Linearisation(eqx.Module):
+    """Derivatives of the next state and the sensors; a change of state is (positions, velocities, activations).
+
+    Positions change in tangent space, a quaternion by three numbers (m, rad).
+
+    Attributes:
+        A: derivative of the next state by the present one.
+        B: derivative of the next state by the controls.
+        C: derivative of the sensors by the present state.
+        D: derivative of the sensors by the controls.
+    """
+
+    A: Float[Array, "changes changes"]
+    B: Float[Array, "changes nu"]
+    C: Float[Array, "nsensordata changes"]
+    D: Float[Array, "nsensordata nu"]
+
+
+def linearise(
+    scene: Scene, state: State, ctrl: Float[ArrayLike, " nu"] | None = None, *, contact: Contact = Slope()
+) -> Linearisation:
+    """Return the linear model of one step from a state; use `jax.vmap` for a batch of states.
+
+    The controls are the scene's resting ones by default. Contact is stepped as in `rollout`: the default is the model of the
+    outcome, and `mg.Discrete()` corresponds to `mjd_transitionFD`, whose D by MuJoCo 3.17 has the wrong sign if centred.
+
+    Raises:
+        ValueError: as `rollout`.
+    """
+    check_start(scene, state)
+    ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
+    sequence_of(ctrl[None], None, 1, scene.model.nu)
+    return Linearisation(*engine_of(scene, contact).linearise(scene, state, ctrl, contact))
+
+
+def sequence_of(
+    controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
+) -> tuple[Array | None, int]:
+    """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
+    given = {"controls": None if callable(controls) else controls, "noise": noise}
+    given = {name: real(name, value) for name, value in given.items() if value is not None}
+    lengths = {name: len(value) for name, value in given.items() if value.ndim}
+    if horizon is not None:
+        lengths["horizon"] = whole("horizon", horizon)
+    if not lengths:
+        raise ValueError("horizon must be given where neither controls nor noise give it, got None")
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"controls, noise and horizon must agree on the number of steps, got {told}")
+    horizon = next(iter(lengths.values()))
+    if horizon < 1:
+        raise ValueError(f"horizon must be at least 1, got {horizon}")
+    for name, value in given.items():
+        if jnp.shape(value) != (horizon, num_controls):
+            meaning = "one row per step and one column per actuator"
+            is_turned = jnp.ndim(value) == 2 and jnp.shape(value)[0] == num_controls > 1
+            wanted = (len(value[0]) if is_turned else horizon, num_controls)
+            hint = "; transpose it" * is_turned
+            raise ValueError(f"{name} must have shape {wanted}, {meaning}, got {jnp.shape(value)}{hint}")
+        numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
+        if numbers is not None and not np.isfinite(numbers).all():
+            row, column = np.argwhere(~np.isfinite(numbers))[0]
+            raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")
+    return given.get("controls"), horizon
+
+
+def check_start(scene: Any, state: Any) -> None:
+    """Refuse what is no scene or no state, a state of another scene, or several states at once."""
+    check_scene(scene)
+    instance("state", state, State, "of mg.initial_state, or the end of a rollout")
+    for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na)):
+        if (shape := jnp.shape(getattr(state, name))) != (size,):
+            remedy = "map over batches with jax.vmap"
+            raise ValueError(f"state.{name} must have shape ({size},) in this scene, got {shape}: {remedy}")
+
+
+def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:
+    """Return the further inputs of each step; refuse unknown ones."""
+    found = {}
+    for name, value in ({} if inputs is None else inputs).items():
+        if name not in INPUTS[1:]:
+            raise ValueError(f"inputs must be among {', '.join(INPUTS[1:])}, got {name!r}")
+        shape = (horizon, *getattr(scene.data, name).shape)
+        if np.shape(value) != shape:
+            raise ValueError(f"inputs[{name!r}] must have shape {shape}, one row per step, got {np.shape(value)}")
+        numbers = known(value)
+        if numbers is not None and not np.isfinite(numbers).all():
+            raise ValueError(f"inputs[{name!r}] must be finite, got {numbers[~np.isfinite(numbers)][0]}")
+        found[name] = jnp.asarray(value, getattr(scene.data, name).dtype)
+    return found
