@@ -70,8 +70,10 @@ def test_what_rollouts_leave_out_is_shown_by_the_engine(scene):
 
 def test_zero_columns_of_contacts_are_counted():
     """A ball and a pendulum over a floor: 6, 1 and 6 + 1 of 7 columns move the floor and each, and each other."""
-    bodies = "<body pos='0 0 1'><freejoint/><geom size='.1'/></body><body pos='2 0 1'><joint/><geom pos='.3 0 0' size='.1'/></body>"
-    text = load_scene(f"<mujoco><worldbody><geom type='plane' size='1 1 1'/>{bodies}</worldbody></mujoco>").summary()
+    ball = "<body pos='0 0 1'><freejoint/><geom size='.1'/></body>"
+    pendulum = "<body pos='2 0 1'><joint/><geom pos='.3 0 0' size='.1'/></body>"
+    floor = "<geom type='plane' size='1 1 1'/>"
+    text = load_scene(f"<mujoco><worldbody>{floor}{ball}{pendulum}</worldbody></mujoco>").summary()
     assert "7 of 21: these joints" in text
 
 

@@ -1,0 +1,96 @@
+"""What is put back is at work, changes no result, and is told."""
+
+import pytest
+
+from experiments import ablation
+from experiments.ablation import Cost, Outcome, Settings, Sizes, answer, drawings, findings, tables, verdict
+from experiments.problems import left_out
+from experiments.problems.left_out import ONLY_GRADIENT, PARTS, file_of, is_left_out, program
+
+_SIZES = Sizes(scenes={"sensing_arm": ("rows",)}, batch=2, few=2, horizon=3, repeats=2)
+_SETTINGS = Settings(experiment="ablation", sizes=_SIZES)
+
+
+@pytest.fixture(scope="module")
+def starts():
+    return ablation._starts(file_of("sensing_arm").compile(), 2, 3, 0)
+
+
+def _text(key, work, starts):
+    parts = [PARTS[key]] if key else []
+    return program("sensing_arm", parts, "mjx", work, starts).lowered.as_text()
+
+
+@pytest.mark.parametrize("work", ["forward", "gradient"])
+def test_each_part_put_back_makes_another_program(work, starts):
+    """Equal text would be a part that is not put back, and a measured factor of nothing."""
+    keys = ["rows", "cold", "columns", "record", "carry", "numbers", "mjx.step"] if work == "forward" else ["values"]
+    texts = [_text(key, work, starts) for key in ["", *keys]]
+    assert len(set(texts)) == len(texts)
+
+
+def test_c_mujoco_gives_the_same_gradient_with_parts_put_back(monkeypatch, starts):
+    """Columns by velocity that compute every stage are differences of one side, of the same width: equal to rounding over it."""
+    begun = []
+    monkeypatch.setattr(left_out, "_BEGIN", lambda *a, own=left_out._BEGIN: begun.append(1) or own(*a))
+    keys = [key for key in PARTS if key in ONLY_GRADIENT and is_left_out(key, "sensing_arm", "mujoco")]
+    assert keys == ["solution", "stages", "geoms"]
+    costs = ablation._compare("sensing_arm", "mujoco", "gradient", {"": []} | {k: [PARTS[k]] for k in keys}, starts, 2)
+    assert begun
+    differences = {cost.part: cost.difference for cost in costs}
+    assert differences["geoms"] == 0.0
+    assert differences["stages"] < 1e-7
+    assert 0.0 < differences["solution"] < 1e-4
+
+
+def test_runge_and_kutta_have_no_inverse_to_leave_out():
+    assert not any(is_left_out(key, "hopper", "mujoco") for key in ONLY_GRADIENT)
+
+
+def test_inert_parts_are_what_a_step_cannot_know_to_be_inert():
+    rows, forces = file_of("cartpole"), file_of("cartpole")
+    PARTS["rows"].edit(rows)
+    PARTS["forces"].edit(forces)
+    model, other = rows.compile(), forces.compile()
+    assert model.jnt_limited.all()
+    assert (model.dof_frictionloss > 0).all()
+    assert (model.neq, other.nu, other.ntendon, other.ngravcomp) == (1, 2, 1, 1)
+
+
+def test_a_pair_is_put_back_that_only_masks_keep_apart():
+    """Of the arm's three pairs the floor and the lower link touch, and the two links are parent and child."""
+    file = file_of("falling_arm")
+    assert PARTS["pairs"].edit(file)
+    (pair,) = file.pairs
+    assert {pair.geomname1, pair.geomname2} == {"floor", "geom 1"}
+
+
+def _outcome():
+    def cost(part, work, factor, difference, engine="mjx"):
+        time = (0.9 * factor, factor, 1.1 * factor)
+        return Cost("hopper", engine, part, work, time, 2 * factor, 1.0, 1e-3, 1e3, 1.0, difference, 1e-16)
+
+    costs = [
+        cost("values", "gradient", 0.5, 0.0),
+        cost("columns", "forward", 3.0, 1e-16),
+        cost("cold", "forward", 1.5, 1e-6),
+    ]
+    costs += [cost("all", work, 4.0, 0.0, engine) for work in ("forward", "gradient") for engine in ("mjx", "mujoco")]
+    return Outcome(_SETTINGS, costs)
+
+
+def test_the_page_names_the_largest_factors_and_what_hurts():
+    outcome = _outcome()
+    assert (
+        answer(outcome) == "columns of contacts: 6× memory (hopper, MJX); columns of contacts: 3× time (hopper, MJX)."
+    )
+    assert len(answer(outcome).split()) <= 15
+    assert "Faster with than without: values within steps on hopper." in verdict(outcome)
+    assert "a cold start of solves: results differ on hopper" in findings(outcome)[0]
+    by_mjx = tables(outcome)[0]
+    assert by_mjx.emphasised == {(1, 3), (2, 3), (3, 3), (3, 7)}
+
+
+def test_the_figure_has_a_panel_for_each_scene_and_engine():
+    figure, _, _ = drawings(_outcome())["factors"](_outcome())
+    assert len(figure.axes) == 2
