@@ -4,6 +4,7 @@ from mjxgrad.planning.controller import Controller
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
+from mjxgrad.planning.tree import Tree, TreePath
 
 __all__ = [
     "Analytic",
@@ -19,6 +20,8 @@ __all__ = [
     "SceneSystem",
     "Smoother",
     "System",
+    "Tree",
+    "TreePath",
     "optimise_trajectory",
     "shifted",
 ]
