@@ -1,0 +1,147 @@
+"""The box crossing: loss against seconds of descents on a published task, beside the published engines."""
+
+import functools
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import jax
+import mujoco
+import numpy as np
+from pydantic import Field, PositiveInt
+
+from experiments.problems.box_crossing import PUBLISHED, Descent, box_crossing, descend
+from experiments.report import Table
+from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
+from experiments.theme import REFERENCE, Drawings, legend_below, looks, subplots
+from experiments.video import film
+from experiments.words import joined
+from experiments.workspace import Workspace
+
+
+class Method(SettingsTable):
+    """One way to descend, by the arguments of `box_crossing` and `descend`."""
+
+    label: str
+    method: Literal["least_squares", "first_order", "alpha_order", "zeroth_order", "cross_entropy"]
+    wheels: Literal["cylinder", "capsule"] = "cylinder"
+    engine: Literal["mujoco", "mjx"] = "mujoco"
+    gradient: Literal["discrete", "slope"] = "discrete"
+    ccd_tolerance: Positive = 1e-14
+    num_steps: PositiveInt
+    num_samples: PositiveInt = 1
+    stddev: Positive = 0.1
+    learning_rate: Positive = 0.3
+
+
+class Settings(RunSettings):
+    """Descents, compared by when they reach a loss (m²) within some seconds; sizes count starts, and the first methods."""
+
+    size: Literal["quick", "default"] = "default"
+    sizes: dict[Literal["num_starts", "num_methods"], PositiveInt]
+    goal: Positive = 0.074
+    seconds: Positive = 15.0
+    methods: Annotated[tuple[Method, ...], Field(min_length=1, max_length=12)]
+    video: VideoSettings | None = VideoSettings(speed=1.0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Descents by label, one per start; and the crossing of least loss on cylinders, if there is one."""
+
+    settings: Settings
+    runs: dict[str, list[Descent]]
+    mj_model: mujoco.MjModel
+    qpos: np.ndarray
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Give each point of each descent, for metrics.csv."""
+        runs = [({"method": label, "start": i}, run) for label, runs in self.runs.items() for i, run in enumerate(runs)]
+        names = ("seconds", "loss_m2", "gradient_norm")
+        return [about | dict(zip(names, row, strict=True)) for about, run in runs for row in np.transpose(run[:3])]
+
+    def found(self, label: str) -> np.ndarray:
+        """Return per descent when it reaches the goal (s), infinite where not in time, and its least loss in time (m²)."""
+        most, goal = self.settings.seconds, self.settings.goal
+        in_time = [(run.seconds[run.seconds <= most], run.loss[run.seconds <= most]) for run in self.runs[label]]
+        return np.array([(min(x[y <= goal], default=np.inf), np.fmin.reduce(y, initial=np.inf)) for x, y in in_time])
+
+    @property
+    def best(self) -> str:
+        """The label that reaches the goal soonest from the worst start."""
+        return min(self.runs, key=lambda label: tuple(self.found(label).max(axis=0)))
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Descend by every method from every start."""
+    jax.config.update("jax_enable_compilation_cache", False)  # compilation is measured
+    methods, runs = settings.methods[: settings.sizes["num_methods"]], {}
+    with workspace.stage("descents", "methods", len(methods)) as advance_to:
+        for one in methods:
+            runs[one.label] = workspace.once(one.label, functools.partial(_descents, one, settings.sizes["num_starts"]))
+            advance_to(len(runs))
+    found = [(one.wheels, run) for one in methods for run in runs[one.label]]
+    wheels, run = min(found, key=lambda pair: (pair[0] == "capsule", np.nanmin(pair[1].loss)))
+    task = box_crossing(wheels)
+    return Outcome(settings, runs, task.scene.mj_model, np.asarray(task.trajectory(run.params).qpos))
+
+
+def _descents(one: Method, count: int) -> list[Descent]:
+    given = one.model_dump(exclude={"label"})
+    task = box_crossing(*(given.pop(name) for name in ("wheels", "engine", "gradient", "ccd_tolerance")))
+    return [descend(task, seed=42 + i, **given) for i in range(count)]
+
+
+def answer(outcome: Outcome) -> str:
+    """Name the method that gets there soonest."""
+    return f"{outcome.best}: {outcome.found(outcome.best)[:, 0].max():.1f} s at worst; published, on a GPU: 10 s."
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say what reaches the loss from every start, and what from none."""
+    times = {f"“{label}”": outcome.found(label)[:, 0] for label in outcome.runs}
+    every = joined(f"{label} ({found.max():.1f} s)" for label, found in times.items() if np.isfinite(found).all())
+    never = joined(label for label, found in times.items() if np.isinf(found).all())
+    goal = f"A loss of {outcome.settings.goal:g} m² within {outcome.settings.seconds:g} s"
+    return f"{goal}: from every start by {every or 'none'}; from no start by {never or 'none'}."
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate all descents, then the published ones."""
+    rows = []
+    for label, runs in outcome.runs.items():
+        times, losses = (" / ".join(f"{x:.3g}".replace("inf", "–") for x in found) for found in outcome.found(label).T)
+        largest = max(np.nanmax(run.gradient_norm, initial=0) for run in runs)
+        rows.append([label, times, f"{runs[0].compile_seconds:.1f}", losses, f"{largest:.2g}"])
+    rows += [[f"{name}, published", f"{x:g}", "", f"{y:g}", ""] for name, (x, y) in PUBLISHED.items()]
+    columns = ("method", f"s to {outcome.settings.goal:g} m²", "s compiling", "least loss, m²", "largest |g|")
+    return [Table(columns, rows, "By start; s without compilation. Published: s to the loss beside, on an RTX 3090.")]
+
+
+def loss(outcome: Outcome):
+    """Draw loss and gradient norm against seconds."""
+    figure, axes = subplots(1, 2, height=5.2, width_ratios=[3, 2])
+    left, right = axes[0]
+    for (label, runs), look in zip(outcome.runs.items(), looks(outcome.runs), strict=True):
+        for i, run in enumerate(runs):
+            name = "_" * (i > 0) + label  # matplotlib leaves those that begin so out of the legend
+            left.plot(run.seconds, np.fmin.accumulate(run.loss), label=name, color=look["color"], lw=1.2)
+            right.plot(run.seconds, run.gradient_norm, ".", color=look["color"], ms=3)
+    for name, at in PUBLISHED.items():
+        left.plot(*at, "*", color=REFERENCE, ms=11, zorder=5)
+        left.annotate(name, at, (0, 8), textcoords="offset points", ha="center", fontsize=8)
+    left.axhline(outcome.settings.goal, color=REFERENCE, lw=0.8, ls=(0, (1, 2)), zorder=0)
+    for axis, title in zip(axes[0], ("Least loss so far, m²", "Norm of the gradient or its estimate"), strict=True):
+        axis.set(xscale="log", yscale="log", xlabel="s, without compilation", title=title)
+    legend_below(figure, left, 3)
+    return figure, "Loss against seconds", "A line per start. Stars: published, on an RTX 3090. Dotted: the goal."
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figure."""
+    return {"loss": loss}
+
+
+def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tuple[str | None, str]:
+    """Draw the crossing of least loss, and give the file and its caption."""
+    caption = "The crossing of least loss, on cylinders where they were tried, at real speed."
+    return film(workspace, [(outcome.mj_model, outcome.qpos)], wanted, camera="side", caption=caption)
