@@ -32,7 +32,8 @@ from mjxgrad.planning.linear_model import Smoother
 from mjxgrad.planning.system import ControlVector, StateVector, System
 
 _Nodes = dict[str, Any]
-_States = Float[Array, "batch state"]
+_States = Float[Array, "batch state"] | Float[np.ndarray, "batch state"]
+_PerChange = Float[ArrayLike, " _"]
 # Kinds of samples: a pose of what the goal is about, wherever the rest may be; or everything.
 _POSE, _EVERYTHING = 0, 1
 # An extension goes on while each step leaves at most this share of the squared distance.
@@ -73,8 +74,8 @@ class Tree(Printed):
     """Search for controls from a start to a goal; its first search compiles for `compile_seconds`."""
 
     def __init__(
-        self, system: System, goal: Float[ArrayLike, " state"], tolerance: Float[ArrayLike, " n"], *, smoother: Smoother,
-        lower: Float[ArrayLike, " n"], upper: Float[ArrayLike, " n"], resolution: Float[ArrayLike, " n"], reach: ArrayLike,
+        self, system: System, goal: Float[ArrayLike, " state"], tolerance: _PerChange, *, smoother: Smoother,
+        lower: _PerChange, upper: _PerChange, resolution: _PerChange, reach: ArrayLike,
         nominal: Callable[[StateVector, ControlVector], ControlVector] | None = None,
         contact: Callable[[PRNGKeyArray, StateVector], StateVector] | None = None,
         goal_share: float = 0.2, contact_share: float = 0.3, batch: int = 16, max_extension: int = 3,
