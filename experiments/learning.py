@@ -26,21 +26,23 @@ from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
 
-Method = Literal["onset", "discrete", "slope", "alpha", "zeroth", "ppo"]
+Method = Literal["onset", "discrete", "slope", "bundled", "alpha", "zeroth", "ppo"]
 NAMES = {
     "onset": "first order with an onset",
     "discrete": "first order",
     "slope": "first order by the slope",
+    "bundled": "first order, bundled",
     "alpha": "α-order",
     "zeroth": "zeroth order",
     "ppo": "PPO",
 }
-_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", ONSET, ZEROTH, "#777777"), strict=True))
+_COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, ZEROTH, "#777777"), strict=True))
 Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot"]
 _OURS: dict[str, Callable[..., Environment]] = {"pusher": pusher, "quadruped": quadruped, "trot": trot}
 _LOADERS = {name: _OURS.get(name) or getattr(envs.diffrl, name) for name in get_args(Name)}
 _OWN_STEPS = ("cartpole", *_OURS)  # whose time steps are their own
 _SHOWN = 8.0  # s of an episode
+_LOADED = 400 / (35 * 9.81)  # weights of a robot above which BCG bundles: 400 N of a humanoid of 35 kg
 _FINER = 8  # times, by which time steps are shorter where a policy is judged a second time
 
 
@@ -84,6 +86,8 @@ class Settings(RunSettings):
     """λ of the returns that a policy climbs; below 1 derivatives reach less far."""
     largest_sample: Positive = learning.Settings.largest_sample
     """Longer first-order gradients are shortened to it; in units of zeroth-order noise."""
+    num_branches: Annotated[int, Field(ge=2)] = learning.Bundle.num_branches
+    """Of bundled gradients, which learn in so many times fewer environments: by as many derivatives."""
     size: Literal["quick", "default", "full"] = "default"
     """How much is spent."""
     sizes: Sizes
@@ -222,7 +226,7 @@ def _courses(
             [_stepped(one, method) for one in environments],
             jax.random.split(jax.random.key(settings.seed), settings.sizes.num_seeds),
             num_updates=num_updates,
-            settings=_how(settings, method),
+            settings=_how(settings, method, environment),
             log=lambda done, _: advance_to(done),
             log_every=_every(settings),
             checkpoint=workspace.keep(method),
@@ -303,11 +307,16 @@ def _judged_course(
     )
 
 
-def _how(settings: Settings, method: Method) -> learning.Settings:
+def _how(settings: Settings, method: Method, environment: Environment) -> learning.Settings:
     own = {"actor_rate": settings.actor_rate, "stddev": settings.stddev}
     changes: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
+    count = settings.sizes.num_environments
+    if method == "bundled":
+        count = max(2, count // settings.num_branches)
+        weight = 9.81 * float(environment.scene.model.body_mass.sum())
+        changes["bundle"] = learning.Bundle(settings.num_branches, force=_LOADED * weight)
     return (apg if settings.algorithm == "apg" else learning.Settings)(
-        num_environments=settings.sizes.num_environments,
+        num_environments=count,
         window=settings.window,
         critic_rate=settings.critic_rate,
         trace=settings.trace,

@@ -176,8 +176,8 @@ class ActorCritic(Method):
         def one(shared, state: EnvState, model_key: PRNGKeyArray, noise: Array):
             arrays, *others = shared
             own = eqx.combine(arrays, structure)
-            weights = {"discount": self.settings.discount, "trace": self.settings.trace}
-            return window_gradients(own, state, model_key, noise, *others, **weights)
+            how = {name: getattr(self.settings, name) for name in ("discount", "trace", "bundle")}
+            return window_gradients(own, state, model_key, noise, *others, **how)
 
         # The environment is passed, not closed over: jax 0.11 refuses closed-over arrays of all devices inside a shard.
         shared = (arrays, learner.policy.actor, learner.target, learner.normaliser, stddev)

@@ -7,6 +7,7 @@ import numpy as np
 
 from mjxgrad._arrays import instance, real, whole
 from mjxgrad.batched.device import is_gpu
+from mjxgrad.learning.bundle import Bundle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Settings:
             to a hundredth of the zeroth-order one. Infinity shortens none.
         has_critic: whether a value function estimates the rewards after a window; otherwise they are left out, and `trace`
             must be 1.
+        bundle: branches over which derivatives are averaged where contact pushes hard; None takes them as they are.
     """
 
     num_environments: int = dataclasses.field(default_factory=lambda: 1024 if is_gpu() else 64)
@@ -55,6 +57,7 @@ class Settings:
     critic_batches: int = 4
     largest_sample: float = 0.1
     has_critic: bool = True
+    bundle: Bundle | None = None
 
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
@@ -62,6 +65,8 @@ class Settings:
         for name in ("actor_scale", "actor_rate", "critic_rate", "largest_sample"):
             if not np.asarray(real(name, getattr(self, name))) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.bundle is not None:
+            instance("bundle", self.bundle, Bundle, "of mg.learning.Bundle")
         for name in ("actor_layers", "critic_layers"):
             instance(name, getattr(self, name), Sequence, "a tuple of hidden sizes, such as (64, 64)")
         if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:

@@ -24,6 +24,7 @@ References:
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -33,6 +34,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.envs import Environment, EnvState
+from mjxgrad.learning.bundle import Bundle
 from mjxgrad.learning.networks import Network, Normaliser
 
 Value = Callable[[Float[Array, " seen"]], Float[Array, ""]]
@@ -144,6 +146,7 @@ def run_window(
     normaliser: Normaliser,
     noise: Float[Array, "steps nu"],
     trace: float = 1.0,
+    bundle: Bundle | None = None,
 ) -> tuple[Window, EnvState]:
     """Run a policy for one step per row of noise, which is added to actions before squashing.
 
@@ -152,7 +155,8 @@ def run_window(
 
     def advance(state: EnvState, added: Array) -> tuple[EnvState, Window]:
         action = jnp.tanh(actor(normaliser.of_first(state.obs.size)(state.obs)) + added)
-        stepped, following = environment.step_on(state, action)
+        step_on = environment.step_on if bundle is None else functools.partial(bundle.step_on, environment)
+        stepped, following = step_on(state, action)
         ends = (stepped.terminated, stepped.truncated)
         if trace != 1:
             following = _faded(following, trace)
@@ -185,6 +189,7 @@ def window_gradients(
     stddev: Float[Array, ""],
     discount: float,
     trace: float = 1.0,
+    bundle: Bundle | None = None,
 ) -> tuple[Window, EnvState, Gradients]:
     """Run a window in one environment and differentiate its return; under `jax.vmap`, in many.
 
@@ -197,7 +202,7 @@ def window_gradients(
         return critic(normaliser(seen))
 
     def gain(change: Float[Array, "steps nu"]):
-        window, final = run_window(copy, state, actor, normaliser, stddev * noise + change, trace)
+        window, final = run_window(copy, state, actor, normaliser, stddev * noise + change, trace, bundle)
         return returned(window, value, discount, trace), (window, final)
 
     first, (window, final) = jax.grad(gain, has_aux=True)(jnp.zeros_like(noise))

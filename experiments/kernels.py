@@ -1,0 +1,188 @@
+"""Smoothing kernels: the noise that each softened contact averages over, and what its tail buys far from contact."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import Field
+from scipy import stats
+
+import mjxgrad as mg
+from experiments.problems.planar_pusher import planar_pusher
+from experiments.report import Table
+from experiments.settings import Positive, RunSettings
+from experiments.theme import FIRST, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
+from experiments.words import joined, quantity
+from experiments.workspace import Workspace
+from mjxgrad.planning import Analytic, GoalCost, optimise_trajectory
+
+_SIZE = np.sqrt(2 / np.pi)  # mean |w| of all kernels, in lengths
+# Name, colour and distribution by kernel. The distributions are scipy's, not the library's: samples are drawn from them.
+KERNELS: dict[str, tuple[str, str, Any]] = {
+    "gaussian": ("Gaussian", FIRST, stats.norm()),
+    "logistic": ("logistic", ZEROTH, stats.logistic(scale=_SIZE / (2 * np.log(2)))),
+    "log_barrier": ("log barrier", ONSET, stats.t(2, scale=_SIZE / np.sqrt(2))),
+}
+_NEAR = np.linspace(-2, 4, 121)  # distances, in lengths
+_SAMPLED = slice(0, 100, 10)  # those where forces are sampled; farther off few samples touch
+_FAR, _TOLD = np.geomspace(0.1, 100, 31), (10, 20)  # the table tells those at 1 and 10
+# Its impedance is the same at every depth, so that the law is exactly a mean.
+_BALL = """<mujoco model="ball"><option gravity="0 0 0" tolerance="1e-12"/><worldbody>
+  <geom type="plane" size="1 1 .1"/><body pos="0 0 .1"><joint type="slide" axis="0 0 1"/>
+  <geom size=".1" mass="1" priority="1" condim="1" solimp="0.9 0.9"/></body></worldbody></mujoco>"""
+_GOAL, _ARRIVED = (0.05, 0.15, 0.4), 0.02  # pose of the rod (m, m, rad), and how near it must be (m)
+_PUSH_LENGTH = 0.05  # m, of the noise around the rod when planning begins; it falls to a fiftieth
+_PARTS = 20
+_plan = eqx.filter_jit(optimise_trajectory)
+
+
+class Settings(RunSettings):
+    """A ball above a floor, and a rod that a finger is to push, under each kernel."""
+
+    length: Positive
+    """Length of the noise under the ball (m)."""
+    num_samples: Annotated[int, Field(ge=200)]
+    """Samples of the noise for each mean of forces."""
+    gaps: tuple[Positive, ...]
+    """Gaps between finger and rod at the start of a push (m)."""
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """What one kernel does to a ball of 1 kg: forces in N, and slopes of the speed after a step by the height in 1/s."""
+
+    near: Float[np.ndarray, " near"]  # forces of the smoothed step
+    far: Float[np.ndarray, "2 far"]  # forces and slopes
+    means: Float[np.ndarray, "2 sampled"]  # of MuJoCo's force over samples, and their standard errors
+    misses: Float[np.ndarray, " gaps"]  # distance of the pushed rod from its goal (m)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All kernels, and MuJoCo's own force."""
+
+    settings: Settings
+    kernels: dict[str, Kernel]
+    hard: Float[np.ndarray, " near"]
+
+    @property
+    def off(self) -> float:
+        """Largest difference between a law and a mean, in standard errors."""
+        each = [(k.near[_SAMPLED] - k.means[0]) / k.means[1] for k in self.kernels.values()]
+        return float(np.abs(each).max())
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per kernel and sampled distance, for metrics.csv."""
+        return [
+            {"kernel": name, "distance_m": self.settings.length * r, "force_N": force, "mean_N": mean, "error_N": error}
+            for name, one in self.kernels.items()
+            for r, force, mean, error in zip(_NEAR[_SAMPLED], one.near[_SAMPLED], *one.means, strict=True)
+        ]
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Step the ball, sample MuJoCo's force, and plan pushes, by each kernel."""
+    with workspace.stage("kernels", "kernels", len(KERNELS)):
+        kernels = {name: workspace.once(name, lambda name=name: _kernel(settings, name)) for name in KERNELS}
+    return Outcome(settings, kernels, _motion(mg.Discrete(), settings.length * _NEAR)[0])
+
+
+def _kernel(settings: Settings, name: str) -> Kernel:
+    contact = mg.Smoothing(settings.length, kernel=name)
+    near, far = (_motion(contact, settings.length * r) for r in (_NEAR, _FAR))
+    misses = np.array([_miss(name, gap) for gap in settings.gaps])
+    return Kernel(near[0], far, _means(settings, name, near[0]), misses)
+
+
+def _motion(contact: Any, heights: np.ndarray) -> np.ndarray:
+    """Return the force of contact at each height, and the slope of the speed after a step by the height."""
+    scene = mg.load_scene(_BALL)
+
+    def speed(height: Array) -> tuple[Array, Array]:
+        moved = mg.step(scene.model, scene.data.replace(qpos=height[None]), contact=contact)
+        return moved.qvel[0], moved.qacc[0]
+
+    slopes, forces = jax.jit(jax.vmap(jax.grad(speed, has_aux=True)))(jnp.asarray(heights))
+    return np.stack([forces, slopes])
+
+
+def _means(settings: Settings, name: str, forces: np.ndarray) -> np.ndarray:
+    """Return means of MuJoCo's force over samples of the noise, and their standard errors.
+
+    They are by its inverse dynamics, at the smoothed step's acceleration: the mean is over the law, not over the motion.
+    Samples are stratified, in independent parts whose spread gives the error: Student's t alone has no variance.
+    """
+    model, random, samples = mujoco.MjModel.from_xml_string(_BALL), np.random.default_rng(settings.seed), []
+    data, count = mujoco.MjData(model), settings.num_samples // _PARTS
+    for r, force in zip(_NEAR[_SAMPLED], forces[_SAMPLED], strict=True):
+        for w in KERNELS[name][2].ppf((np.arange(count) + random.uniform(size=(_PARTS, count))) / count).ravel():
+            data.qpos[:], data.qacc[:] = settings.length * (r + w), force
+            mujoco.mj_inverse(model, data)
+            samples.append(data.qfrc_constraint[0])
+    each = np.reshape(samples, (-1, _PARTS, count)).mean(axis=2)
+    return np.stack([each.mean(axis=1), each.std(axis=1, ddof=1) / np.sqrt(_PARTS)])
+
+
+def _miss(name: str, gap: float) -> float:
+    """Plan a push from rest while the smoothing vanishes, and return how far from its goal the rod ends (m)."""
+    task, weight = planar_pusher((0.0, -0.04 - gap), _GOAL), jnp.array((0, 0, 1, 1, 0.03, 0, 0, 0, 0, 0))
+    problem = task.system, GoalCost(task.goal, 0.3 * weight, 100 * weight, 0.02), task.start, jnp.zeros((25, 2))
+    smoother = Analytic(mg.Smoothing(_PUSH_LENGTH, kernel=name))
+    end = _plan(*problem, jax.random.key(0), smoother=smoother, schedule=np.geomspace(1, 0.02, 40)).states[-1]
+    return float(jnp.linalg.norm(end[2:4] - jnp.asarray(_GOAL[:2])))
+
+
+def answer(outcome: Outcome) -> str:
+    """Say whether laws are means, and from how far each finds the push."""
+    reach = {n: np.compress(k.misses <= _ARRIVED, outcome.settings.gaps) for n, k in outcome.kernels.items()}
+    told = joined(f"{max([0.0, *gaps]):g} ({KERNELS[name][0]})" for name, gaps in reach.items())
+    return f"Samples {'agree' if outcome.off < 5 else 'disagree'}; pushes found from {told} m."
+
+
+def verdict(outcome: Outcome) -> str:
+    """Say how near laws are to means, and what is left ten lengths away."""
+    far = joined(f"{quantity(k.far[0, _TOLD[1]])} N ({KERNELS[name][0]})" for name, k in outcome.kernels.items())
+    near = f"The smoothed step's force is within {outcome.off:.1f} standard errors of the mean of MuJoCo's over the density."
+    return f"{near} Ten lengths away, where nothing touches, the ball still feels {far}."
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate forces and slopes near and far."""
+    rows = [[KERNELS[n][0], *map(quantity, k.far[:, _TOLD].T.ravel().tolist())] for n, k in outcome.kernels.items()]
+    heads = ("kernel", "force at 1 (N)", "slope at 1 (1/s)", "force at 10 (N)", "slope at 10 (1/s)")
+    return [Table(heads, rows, "Forces, and slopes of the speed by the height, at 1 and 10 lengths.")]
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figure."""
+    return {"kernels": kernels}
+
+
+def kernels(outcome: Outcome):
+    """Draw forces near contact, slopes far from it, and where the rod ends."""
+    figure, axes = subplots(1, 3, height=3.9)
+    near, far, push = axes[0]
+    near.plot(_NEAR, outcome.hard, color=REFERENCE, lw=1, ls=(0, (3, 2)), label="MuJoCo's own")
+    for name, one in outcome.kernels.items():
+        label, colour, _ = KERNELS[name]
+        near.plot(_NEAR, one.near, color=colour, label=label)
+        near.errorbar(_NEAR[_SAMPLED], one.means[0], 2 * one.means[1], color=colour, fmt="o", ms=3.5, lw=1)
+        far.plot(_FAR, -one.far[1], color=colour)
+        gaps = np.array(outcome.settings.gaps) / _PUSH_LENGTH
+        push.plot(gaps, 1e3 * one.misses, color=colour, marker="o")
+    near.set(title="Force on the ball (N)", xlabel="distance / length")
+    far.set(title="Slope of its speed by its height (1/s)", xlabel="distance / length", xscale="log")
+    far.set(yscale="log", ylim=(1e-9, 10))
+    push.set(title="Pushed rod from its goal (mm)", xlabel="gap at the start / length", ylim=(0, None))
+    plain(far.xaxis)
+    legend_below(figure, near, 4)
+    caption = (
+        "Left, lines by the smoothed step, dots means of MuJoCo's force over samples of the density, at the same acceleration. "
+        "Middle, what is left of the gradient of one step. Right, where a finger that does not touch a rod is planned to push it."
+    )
+    return figure, "Force at a distance, its gradient, and a push that it finds", caption
