@@ -24,53 +24,43 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from mjxgrad._arrays import instance, one_key, whole
-from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Smoother
 from mjxgrad.planning.system import ControlVector, StateVector, System
 
 _Nodes = dict[str, Any]
-_States = Float[Array, "batch state"] | Float[np.ndarray, "batch state"]
 _PerChange = Float[ArrayLike, " _"]
-# Kinds of samples: a pose of what the goal is about, wherever the rest may be; or everything.
-_POSE, _EVERYTHING = 0, 1
-# An extension goes on while each step leaves at most this share of the squared distance.
-_PROGRESS = 0.98
+_POSE, _EVERYTHING = 0, 1  # what counts of a sample: what the goal is about, or all
+_PROGRESS = 0.98  # an extension goes on while each step leaves at most this share of the squared distance
 
 
-class TreePath(eqx.Module, Printed):
+class TreePath(eqx.Module):
     """The way to the node nearest to the goal, and the tree.
 
     Attributes:
         found: whether that node is at the goal within its tolerance.
         states: states of the path, the start first.
         controls: controls between them, one row per step of the system.
-        error: distance of the last state from the goal in units of its tolerance, the largest over coordinates.
         nodes: states of all nodes, the start first.
         parents: number of each node's parent, −1 for the start.
-        errors: distance of each node from the goal, as `error`.
-        num_steps: steps that were tried, kept or not, each with its linear model.
+        errors: distance of each node from the goal in units of its tolerance, the largest over coordinates.
+        num_steps: steps that were tried, kept or not.
         seconds: duration of the search (s), without compilation.
     """
 
     found: bool
     states: Float[np.ndarray, "states state"]
     controls: Float[np.ndarray, "horizon m"]
-    error: float
     nodes: Float[np.ndarray, "nodes state"]
     parents: Int[np.ndarray, " nodes"]
     errors: Float[np.ndarray, " nodes"]
     num_steps: int
     seconds: float
 
-    def __str__(self) -> str:
-        end = "found" if self.found else f"not found; the nearest node is {format_number(self.error)} tolerances away"
-        return f"{len(self.controls)} steps to the goal in {len(self.nodes)} nodes and {self.seconds:.1f} s: {end}."
 
-
-class Tree(Printed):
+class Tree:
     """Search for controls from a start to a goal; its first search compiles for `compile_seconds`."""
 
     def __init__(
@@ -92,15 +82,15 @@ class Tree(Printed):
             resolution: change of each coordinate that needs no cause; infinite where one never matters, such as a speed.
             reach: how far a step's controls go from the nominal one, a number or one per control.
             nominal: nominal control in a state that a control led to; None holds that control, as suits position servos.
-            contact: state in which to begin elsewhere, from a key and a node's state, such as a hand that touches the object
-                at another place; None is anywhere between the bounds, with what the goal is about as in the node.
+            contact: state in which to begin elsewhere, from a key and a node's state; None is anywhere between the bounds,
+                but what the goal is about as in the node.
             goal_share: share of the samples that are the goal.
             contact_share: share of the samples that are from `contact`, of which all coordinates matter.
             batch: samples per turn; a step of all is one call.
             max_extension: most steps towards one sample.
 
         Raises:
-            ValueError: if shapes do not fit, no coordinate matters for the goal, or a number is not positive.
+            ValueError: if shapes do not fit, a number is not positive, or no coordinate matters for the goal.
         """
         instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
         instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
@@ -111,19 +101,16 @@ class Tree(Printed):
         given = {"tolerance": tolerance, "lower": lower, "upper": upper, "resolution": resolution}
         for name, value in given.items():
             if np.shape(value) != (system.num_changes,):
-                raise ValueError(
-                    f"{name} must have shape ({system.num_changes},), one per coordinate, got {np.shape(value)}"
-                )
+                raise ValueError(f"{name} must have shape ({system.num_changes},), got {np.shape(value)}")
         self.tolerance, self.lower, self.upper, widths = (np.asarray(x, dtype) for x in given.values())
         self.reach = np.broadcast_to(np.asarray(reach, dtype), (system.num_controls,))
         matters = np.isfinite(self.tolerance) & np.isfinite(widths)
-        if not matters.any() or not (self.tolerance > 0).all() or not (widths > 0).all():
-            raise ValueError("tolerance and resolution must be positive, and both finite for one coordinate at least")
-        if not (np.isfinite(self.reach) & (self.reach > 0)).all():
-            raise ValueError(f"reach must be positive and finite, got {self.reach}")
+        if not all((x > 0).all() for x in (self.tolerance, widths, self.reach)) or np.isinf(self.reach).any():
+            raise ValueError("tolerance, resolution and reach must be positive, and the last one finite")
+        if not matters.any():
+            raise ValueError("tolerance and resolution must both be finite for one coordinate at least")
         self.weights = jnp.asarray(np.stack([np.where(matters, widths**-2.0, 0.0), widths**-2.0]), dtype)
-        self._programs: dict[tuple, Any] = {}
-        self.compile_seconds = 0.0
+        self._programs, self.compile_seconds = {}, 0.0
 
     def search(
         self, start: Float[ArrayLike, " state"], control: Float[ArrayLike, " m"], key: PRNGKeyArray, *,
@@ -141,72 +128,72 @@ class Tree(Printed):
         Returns:
             The path to the node nearest to the goal; with the same key the same, unless the time was over.
         """
-        began, num_steps, turn, dtype = time.perf_counter() - self.compile_seconds, 0, 0, self.goal.dtype
-        spent = lambda: time.perf_counter() - self.compile_seconds - began  # noqa: E731
         one_key(key)
+        began, num_steps, turn, before = time.perf_counter() - self.compile_seconds, 0, 0, 0
+        spent = lambda: time.perf_counter() - self.compile_seconds - began  # noqa: E731
         keys = jax.random.split(key, self.batch)
-        start, samples = np.asarray(start, dtype), np.tile(np.asarray(start, dtype), (self.batch, 1))
-        controls, kinds, at = np.tile(np.asarray(control, dtype), (self.batch, 1)), np.zeros(self.batch, int), keys
+        start, first = np.asarray(start, self.goal.dtype), np.asarray(control, self.goal.dtype)
+        samples, controls, kinds = *(np.tile(x, (self.batch, 1)) for x in (start, first)), np.zeros(self.batch, int)
         new = self._ran(self._made, samples, controls, keys, self.goal, samples, kinds)
         nodes = {name: np.zeros((whole("capacity", capacity), *x.shape[1:]), x.dtype) for name, x in new.items()}
-        nodes |= {"parent": np.full(capacity, -1), "is_node": np.zeros(capacity, bool)}
+        nodes |= {"parent": np.zeros(capacity, int), "is_node": np.zeros(capacity, bool)}
         size, _ = _added(nodes, 0, new, np.arange(self.batch) == 0, np.full(self.batch, -1))
-        while nodes["error"][:size].min() > 1 and size < capacity and spent() < max_seconds:
-            turn, num_before = turn + 1, size
+        # A turn that adds nothing is the last: no node moves to finite numbers.
+        while nodes["error"][:size].min() > 1 and before < size < capacity and spent() < max_seconds:
+            turn, before = turn + 1, size
             keys = jax.random.split(jax.random.fold_in(key, turn), self.batch)
             samples, kinds, at, distance = self._ran(self._chosen, nodes, size, keys, self.goal, start)
             here, is_on = {name: nodes[name][at] for name in new}, np.isfinite(distance)
             for step in range(self.max_extension):
                 states, controls = self._ran(self._moved, here, samples, kinds)
-                keys = jax.vmap(jax.random.fold_in, (0, None))(keys, step)
                 here = self._ran(self._made, states, controls, keys, self.goal, samples, kinds)
                 is_on &= np.isfinite(states).all(axis=1) & ((here["distance"] < _PROGRESS * distance) | (step == 0))
                 size, at = _added(nodes, size, here, is_on, at)
                 distance, num_steps = here["distance"], num_steps + self.batch
                 if not is_on.any():
                     break
-            if size == num_before:
-                break  # no node can move
-        return _path(nodes, size, num_steps, spent())
+        line = [int(np.argmin(nodes["error"][:size]))]
+        while line[-1] > 0:
+            line.append(int(nodes["parent"][line[-1]]))
+        path = bool(nodes["error"][line[0]] <= 1), nodes["state"][line[::-1]], nodes["control"][line[-2::-1]]
+        every = [nodes[name][:size] for name in ("state", "parent", "error")]
+        return TreePath(*path, *every, num_steps, spent())  # pyright: ignore[reportCallIssue]
 
     def _ran(self, function: Callable, *given: Any) -> Any:
         """Run a method's program; its compilation is counted apart."""
-        shapes = tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(given) if hasattr(x, "shape"))
-        if (name := (function.__name__, shapes)) not in self._programs:
+        if (name := (function.__name__, *map(jnp.shape, jax.tree.leaves(given)))) not in self._programs:
             began = time.perf_counter()
             self._programs[name] = jax.jit(function).lower(*given).compile()
             self.compile_seconds += time.perf_counter() - began
         return jax.tree.map(np.array, self._programs[name](*given))
 
-    def _made(self, states: _States, controls: Array, keys: Array, goal: StateVector, samples: _States, kinds: Array):
+    def _made(self, states: Any, controls: Array, keys: Array, goal: StateVector, samples: Any, kinds: Array):
         """Return nodes, with what each can reach, and the distance of a sample from it."""
 
         def one(state, control, key, sample, kind) -> _Nodes:
             nominal = self.nominal(state, control)
             B = self.smoother.linear_model(self.system, state, nominal, key).B * self.reach
-            gram = jnp.einsum("nm,kn,np->kmp", B, self.weights, B)
-            inverse = jnp.linalg.inv(jnp.eye(B.shape[1], dtype=B.dtype) + gram)
+            inverse = jnp.linalg.inv(jnp.eye(B.shape[1]) + jnp.einsum("nm,kn,np->kmp", B, self.weights, B))
             error = jnp.max(jnp.abs(self.system.difference(state, goal)) / self.tolerance)
-            node = {"state": state, "control": control, "B": B, "inverse": inverse, "error": error}
-            node["centre"] = self.system.step(state, nominal)
+            node = {"state": state, "control": control, "centre": self.system.step(state, nominal), "B": B}
+            node |= {"inverse": inverse, "error": error}
             return node | {"distance": self._distance(node, sample, kind)[0]}
 
         return jax.vmap(one)(states, controls, keys, samples, kinds)
 
-    def _distance(self, node: _Nodes, sample: StateVector, kind: Array) -> tuple[Float[Array, ""], ControlVector]:
+    def _distance(self, node: _Nodes, sample: Any, kind: Array) -> tuple[Float[Array, ""], ControlVector]:
         """Return the squared distance of a sample, and the control that leads there, in units of the reach."""
         away = self.system.difference(sample, node["centre"])
-        weighted = self.weights[kind] * away
-        pulled = node["B"].T @ weighted
+        pulled = node["B"].T @ (weighted := self.weights[kind] * away)
         control = node["inverse"][kind] @ pulled
         return away @ weighted - pulled @ control, control
 
-    def _moved(self, nodes: _Nodes, samples: _States, kinds: Array) -> tuple[_States, Float[Array, "batch m"]]:
+    def _moved(self, nodes: _Nodes, samples: Any, kinds: Array) -> tuple[Array, Array]:
         """Return the next states towards samples, and their controls."""
         changes = jax.vmap(self._distance)(nodes, samples, kinds)[1]
         changes = self.reach * changes / jnp.maximum(1.0, jnp.abs(changes).max(axis=1, keepdims=True))
-        controls = jax.vmap(self.nominal)(nodes["state"], nodes["control"]) + changes
-        controls = jnp.clip(controls, *self.system.control_limits)
+        nominal = jax.vmap(self.nominal)(nodes["state"], nodes["control"])
+        controls = jnp.clip(nominal + changes, *self.system.control_limits)
         return jax.vmap(self.system.step)(nodes["state"], controls), controls
 
     def _chosen(self, nodes: _Nodes, size: Array, keys: Array, goal: StateVector, start: StateVector):
@@ -223,20 +210,17 @@ class Tree(Printed):
             kind = jnp.where(share > 1 - self.contact_share, _EVERYTHING, _POSE)
             anywhere = jnp.where(kind == _EVERYTHING, other, self.system.retract(start, place))
             sample = jnp.where(share < self.goal_share, goal, anywhere)
-            parts = {name: nodes[name] for name in ("centre", "B", "inverse")}
-            found = jax.vmap(lambda node: self._distance(node, sample, kind)[0])(parts)
+            found = jax.vmap(lambda node: self._distance(node, sample, kind)[0])(nodes)
             # Each sample sees half of the nodes: the nearest of all, if it can go no further, would else be tried for ever.
             is_there = nodes["is_node"] & jnp.isfinite(found)
             is_seen = is_there & jax.random.bernoulli(seen_key, shape=found.shape)
-            found = jnp.where(jnp.where(is_seen.any(), is_seen, is_there), found, jnp.inf)
+            found = jnp.where(is_seen | (is_there & ~is_seen.any()), found, jnp.inf)
             return sample, kind, jnp.argmin(found), jnp.min(found)
 
         return jax.vmap(one)(keys)
 
 
-def _added(
-    nodes: _Nodes, size: int, new: _Nodes, is_valid: Bool[np.ndarray, " batch"], parents: Int[np.ndarray, " batch"]
-) -> tuple[int, Int[np.ndarray, " batch"]]:
+def _added(nodes: _Nodes, size: int, new: _Nodes, is_valid: np.ndarray, parents: np.ndarray) -> tuple[int, np.ndarray]:
     """Write valid nodes into places that are free; return how many there are, and the place of each."""
     chosen = np.flatnonzero(is_valid)[: len(nodes["parent"]) - size]
     places = parents.copy()
@@ -244,14 +228,3 @@ def _added(
     for name, value in (new | {"parent": parents, "is_node": is_valid}).items():
         nodes[name][places[chosen]] = value[chosen]
     return size + len(chosen), places
-
-
-def _path(nodes: _Nodes, size: int, num_steps: int, seconds: float) -> TreePath:
-    """Return the way to the node nearest to the goal."""
-    line = [int(np.argmin(nodes["error"][:size]))]
-    while (parent := int(nodes["parent"][line[-1]])) >= 0:
-        line.append(parent)
-    line, error = line[::-1], float(nodes["error"][line[0]])
-    path = nodes["state"][line], nodes["control"][line[1:]]
-    every = nodes["state"][:size], nodes["parent"][:size], nodes["error"][:size]
-    return TreePath(error <= 1, *path, error, *every, num_steps, seconds)
