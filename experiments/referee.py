@@ -1,0 +1,332 @@
+"""The referee: gradients of contact by several engines, each against the slope of its own outcome, and their time.
+
+Each engine is installed by pip into an environment of its own, .cache/referee/<engine>, and asked by a program of
+`referee_engines`, which simulates a scene from many starts and differentiates at each, one call at a time. The starts move a
+contact through many time steps; the slope of the engine's outcomes over them is what its derivatives should be on average. An
+engine that cannot be installed, or lacks what a scene needs, costs its rows and nothing else.
+"""
+
+import json
+import math
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import threading
+import tomllib
+from collections import Counter
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import gymnasium
+import numpy as np
+from pydantic import Field
+
+from experiments.parallel import num_cores
+from experiments.report import MOST_WORDS, Table
+from experiments.settings import Positive, RunSettings, SettingsTable
+from experiments.theme import MARKERS, MUTED, OTHERS, REFERENCE, ZEROTH, Drawings, plain, subplots
+from experiments.words import joined, percent, quantity
+from experiments.workspace import Workspace
+from mjxgrad.diagnostics import compare_to_slope, phases
+
+SceneName = Literal["bounce", "push", "slide", "peg", "hopper"]
+EngineName = Literal["mjxgrad", "MJX", "MJX-softened", "brax", "Newton", "jaxsim", "Drake", "MuJoDiCo", "nimble"]
+_FOLDER, _CACHE = Path(__file__).parent / "referee_engines", Path(".cache/referee")
+ENGINES: dict[str, dict[str, Any]] = tomllib.loads((_FOLDER / "engines.toml").read_text(encoding="utf-8"))
+SCENES: dict[str, dict[str, Any]] = tomllib.loads((_FOLDER / "scenes.toml").read_text(encoding="utf-8"))
+_INSTALL, _ANSWER = 900, 600  # s, after which an engine is given up
+_RIGHT = 0.1  # relative error of a mean derivative that is called right
+_LOW, _HIGH = 1e-4, 1e2  # errors in the picture
+
+
+class Sizes(SettingsTable):
+    """How much is measured."""
+
+    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)]
+    """By name."""
+    engines: Annotated[tuple[EngineName, ...], Field(min_length=1)]
+    """By name; those that are not there are installed."""
+    num_starts: Annotated[int, Field(ge=32)]
+    """At which each engine is differentiated."""
+    budget: Positive
+    """Seconds of all gradients of a contestant in a scene, beyond which it is asked at half of the starts, 32 at least."""
+
+
+class Settings(RunSettings):
+    """Error of gradients through contact against their time, by engine."""
+
+    size: Literal["quick", "default"] = "default"
+    """Two scenes and what is installed in a minute or two, or all scenes and engines."""
+    sizes: Sizes
+    """The numbers that go with the size: those of the file's table of that name."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One contestant in one scene, with errors over the size of the slope; times are median and quartiles.
+
+    Attributes:
+        error: of the mean derivative; infinite where not all derivatives are finite.
+        standard_error: of `error`.
+        scatter: standard deviation of single derivatives.
+        compile_seconds: until the first gradient is there.
+    """
+
+    scene: str
+    engine: str
+    variant: str
+    num_starts: int
+    num_finite: int
+    outcome: float
+    slope: float
+    slope_error: float
+    error: float
+    standard_error: float
+    scatter: float
+    seconds: tuple[float, float, float]
+    rollout_seconds: tuple[float, float, float]
+    compile_seconds: float
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the mean derivative is within a tenth of the slope, beyond doubt about either."""
+        return self.error <= _RIGHT and self.standard_error <= _RIGHT
+
+    @property
+    def label(self) -> str:
+        """Engine and variant."""
+        return f"{self.engine} {self.variant}"
+
+    @property
+    def brief(self) -> str:
+        """Error and time, such as "2.6% ± 0.1%, 56 ms"."""
+        return f"{self.told_error}, {1e3 * self.seconds[0]:.3g} ms"
+
+    @property
+    def told_error(self) -> str:
+        """The error in words."""
+        if not math.isfinite(self.error):
+            return "not finite"
+        is_wild = max(self.error, self.standard_error) > _HIGH
+        return f"{quantity(self.error)} times" if is_wild else f"{percent(self.error)} ± {percent(self.standard_error)}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All cells, and a sentence on each that could not be had."""
+
+    settings: Settings
+    cells: list[Cell]
+    missing: list[str]
+    versions: dict[str, str]
+    machine: str
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per cell, for metrics.csv."""
+        return [asdict(cell) | {"versions": self.versions[cell.engine], "machine": self.machine} for cell in self.cells]
+
+    def soonest(self, scene: str) -> Cell | None:
+        """Return the fastest contestant that is right, with the scene's own contact."""
+        fit = (c for c in self.cells if c.scene == scene and c.is_right and "softened" not in ENGINES[c.engine])
+        return min(fit, key=lambda cell: cell.seconds[0], default=None)
+
+
+def measure(settings: Settings, workspace: Workspace) -> Outcome:
+    """Ask every engine about every scene."""
+    sizes = settings.sizes
+    cells, missing, versions = [], [], {}
+    asked = {name: scene for name, scene in scenes(sizes.num_starts).items() if name in sizes.scenes}
+    with workspace.stage("engines", "engines", len(sizes.engines)) as advance_to:
+        for name in sizes.engines:
+            found = workspace.once(name, lambda name=name: _judge(name, asked, sizes.budget))
+            cells, missing, versions[name] = cells + found[0], missing + found[1], found[2]
+            advance_to(len(versions))
+    return Outcome(settings, cells, missing, versions, _machine())
+
+
+def scenes(num_starts: int) -> dict[str, dict[str, Any]]:
+    """Return the scenes, with the values at which each is simulated."""
+    hopper = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+    own = {"hopper": {"xml": hopper.read_text(encoding="utf-8")}}
+    values = {name: phases(tuple(scene["interval"]), num_starts).tolist() for name, scene in SCENES.items()}
+    return {name: scene | own.get(name, {}) | {"name": name, "values": values[name]} for name, scene in SCENES.items()}
+
+
+def _judge(name: str, asked: dict[str, Any], budget: float) -> tuple[list[Cell], list[str], str]:
+    engine = ENGINES[name]
+    request = {"scenes": asked, "variants": engine["variants"], "packages": engine["packages"], "budget": budget}
+    try:
+        python = environment(name, engine["requires"])
+    except (OSError, subprocess.SubprocessError) as error:
+        told = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
+        return [], [f"{name}: not installed: {told}."], "not installed"
+    versions, *answers = ask(python, _FOLDER / f"{engine['program']}.py", request) or [{}]
+    cells, missing = [], []
+    for scene in asked:
+        for variant in engine["variants"]:
+            mine = (one for one in answers if (one["scene"], one["variant"]) == (scene, variant))
+            answer = next(mine, {"error": f"no answer within {_ANSWER} s, or it crashed"})
+            if "error" in answer:
+                missing.append(f"{name} {variant}: no {scene}: {answer['error']}.")
+            else:
+                cells.append(cell(name, answer, engine.get("precision", "float64")))
+    return cells, missing, ", ".join(map(" ".join, versions.items()))
+
+
+def environment(name: str, requires: list[str]) -> str:
+    """Return the Python of an engine's environment, which is made anew if its list of packages has changed."""
+    if not requires:
+        return sys.executable
+    folder = _CACHE / name
+    python, mark = folder / "bin" / "python", folder / "requires.txt"
+    if not mark.is_file() or mark.read_text(encoding="utf-8").splitlines() != requires:
+        shutil.rmtree(folder, ignore_errors=True)
+        pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requires]
+        for command in ([sys.executable, "-m", "venv", str(folder)], pip):
+            subprocess.run(command, check=True, timeout=_INSTALL, capture_output=True, text=True)
+        mark.write_text("\n".join(requires), encoding="utf-8")
+    return str(python.absolute())
+
+
+def ask(python: str, program: Path, request: dict[str, Any], limit: float = _ANSWER) -> list[dict[str, Any]]:
+    """Return an engine's answers, those before it crashed or took longer than the limit (s)."""
+    # Compilation is timed, so it is not taken from the disk.
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_COMPILATION", "PYTHONPATH"))}
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen([python, str(program)], env=kept, text=True, **pipes) as process:
+        timer = threading.Timer(limit, process.kill)
+        timer.start()
+        told, _ = process.communicate(json.dumps(request))
+        timer.cancel()
+    return [json.loads(line) for line in told.splitlines() if line.startswith("{") and line.endswith("}")]
+
+
+def cell(engine: str, answer: dict[str, Any], precision: str = "float64") -> Cell:
+    """Compare the derivatives of one contestant with the slope of its outcomes."""
+    found, outcomes = np.array(answer["derivatives"], float), np.array(answer["outcomes"], precision)
+    is_finite = np.isfinite(found)
+    compared = compare_to_slope(np.array(answer["values"]), outcomes, [np.where(is_finite, found, 0)], ["own"])
+    slope, scale = float(compared.slope), max(abs(float(compared.slope)), float(compared.resolution))
+    relative = [float(np.abs(one[0])) / scale for one in (compared.error, compared.standard_error, compared.spread)]
+    errors = relative if is_finite.all() else [math.inf, math.nan, math.nan]
+    times = [np.quantile(answer[one], [0.5, 0.25, 0.75]).tolist() for one in ("gradient_seconds", "rollout_seconds")]
+    numbers = len(found), int(is_finite.sum()), float(outcomes.mean()), slope, float(compared.slope_error)
+    return Cell(
+        answer["scene"], engine, answer["variant"], *numbers, *errors, *map(tuple, times), answer["compile_seconds"]
+    )
+
+
+def _machine() -> str:
+    about = Path("/proc/cpuinfo")
+    lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
+    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return f"{num_cores()} cores of {name}, Python {platform.python_version()}, {datetime.now(UTC):%Y-%m-%d}"
+
+
+def answer(outcome: Outcome) -> str:
+    """Say whose right gradient is soonest, scene by scene."""
+    names = [cell.engine if (cell := outcome.soonest(scene)) else "nobody" for scene in outcome.settings.sizes.scenes]
+    told = joined(f"{name} in {count}" for name, count in Counter(names).most_common())
+    text = f"Right within {percent(_RIGHT)} and soonest: {told} of {len(names)} scenes."
+    return text if len(text.split()) <= MOST_WORDS else f"{told}, of {len(names)}."
+
+
+def verdict(outcome: Outcome) -> str:
+    """Name the fastest right gradient of each scene, and how often each contestant is right."""
+    names = outcome.settings.sizes.scenes
+    told = [
+        f"{scene}: {f'{one.label} ({one.brief})' if (one := outcome.soonest(scene)) else 'nobody'}" for scene in names
+    ]
+    scenes_of, right = (
+        Counter(cell.label for cell in outcome.cells if cell.is_right or not only) for only in (False, True)
+    )
+    most = [f"{label} in {count} of {scenes_of[label]}" for label, count in right.most_common()]
+    return (
+        f"The fastest gradient within {percent(_RIGHT)} of the slope of its engine's own outcome, by scene: {'; '.join(told)}. "
+        f"Right are {', '.join(most) or 'none'}."
+    )
+
+
+def findings(outcome: Outcome) -> list[str]:
+    """Say where it was measured, how engines were set, and what could not be had."""
+    about = [f"{name} ({told}): {ENGINES[name]['settings']}." for name, told in outcome.versions.items()]
+    return [f"Measured on {outcome.machine}, one call at a time.", *about, *outcome.missing]
+
+
+def tables(outcome: Outcome) -> list[Table]:
+    """Tabulate errors and times side by side, then all numbers."""
+    names, by = outcome.settings.sizes.scenes, {(cell.label, cell.scene): cell for cell in outcome.cells}
+    labels = list(dict.fromkeys(label for label, _ in by))
+    short = [[label, *(by[label, s].brief if (label, s) in by else "–" for s in names)] for label in labels]
+    places = {(labels.index(cell.label), names.index(cell.scene) + 1) for cell in outcome.cells if cell.is_right}
+    questions = "; ".join(f"{name}, {SCENES[name]['question']}" for name in names)
+    caption = (
+        "Error of the mean derivative over the slope of the engine's own outcome, and time of one gradient. Bold: within "
+        f"{percent(_RIGHT)}. Outcomes: {questions}."
+    )
+    columns = (
+        "scene",
+        "contestant",
+        "outcome (m)",
+        "slope",
+        "error",
+        "scatter",
+        "finite",
+        "gradient (ms)",
+        "rollout (ms)",
+    )
+    rows = []
+    for cell in sorted(outcome.cells, key=lambda cell: names.index(cell.scene)):
+        times = [f"{1e3 * m:.3g} ({1e3 * a:.3g} to {1e3 * b:.3g})" for m, a, b in (cell.seconds, cell.rollout_seconds)]
+        numbers = (
+            quantity(cell.outcome),
+            quantity(cell.slope, cell.slope_error),
+            cell.told_error,
+            quantity(cell.scatter),
+        )
+        counts = f"{cell.num_finite} of {cell.num_starts}"
+        rows.append([cell.scene, cell.label, *numbers, counts, *times, f"{cell.compile_seconds:.1f}"])
+    about = "Errors with their standard errors, and scatter of single derivatives, over the slope. Times: median and quartiles."
+    every = Table((*columns, "first call (s)"), rows, about)
+    return [Table(("contestant", *names), short, caption, frozenset(places)), every]
+
+
+def drawings(outcome: Outcome) -> Drawings:
+    """Name the figures."""
+    return {"error_against_time": error_against_time}
+
+
+def error_against_time(outcome: Outcome):
+    """Error of the mean derivative against seconds of one gradient, a panel per scene."""
+    names, rows = outcome.settings.sizes.scenes, -(-(len(outcome.settings.sizes.scenes) + 1) // 3)
+    figure, axes = subplots(rows, 3, height=3.5 * rows, sharex=True, sharey=True)
+    colours = dict(zip(ENGINES, (REFERENCE, ZEROTH, *OTHERS), strict=False))
+    for axis in axes.flat[len(names) :]:
+        axis.axis("off")
+    for axis, name in zip(axes.flat, names, strict=False):
+        for cell in (cell for cell in outcome.cells if cell.scene == name):
+            look = {
+                "color": colours[cell.engine],
+                "marker": MARKERS[ENGINES[cell.engine]["variants"].index(cell.variant)],
+            }
+            ends = np.clip([cell.error - cell.standard_error, cell.error + cell.standard_error], _LOW, _HIGH)
+            axis.plot([cell.seconds[0]] * 2, ends, color=look["color"], lw=0.8, alpha=0.5)
+            axis.plot(cell.seconds[0], np.clip(cell.error, _LOW, _HIGH), ls="", ms=6, label=cell.label, **look)
+        axis.axhline(_RIGHT, color=MUTED, lw=0.8, ls=(0, (3, 2)))
+        axis.set(
+            xscale="log", yscale="log", title=name, ylim=(_LOW / 1.6, _HIGH * 1.6), xlabel="seconds of one gradient"
+        )
+        plain(axis.xaxis)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("error over slope")
+    named = {label: h for axis in axes.flat for h, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    axes.flat[-1].legend(named.values(), named.keys(), loc="center", fontsize=8, ncols=2)
+    caption = (
+        "Lower and further left is better; below the dashed line is right within a tenth. Errors above 100 and gradients that "
+        "are not finite are at the top, errors below 10⁻⁴ at the bottom; bars are one standard error."
+    )
+    return figure, "Error of the gradient against the time of one", caption

@@ -1,0 +1,86 @@
+"""Newton's differentiable solvers on a CPU, taped by Warp, with the step of its own differentiable example (1/480 s).
+
+Contacts are found anew at each step. All numbers are in single precision, the only one that there is.
+"""
+
+import newton
+import warp as wp
+from protocol import Pair, Scene, serve
+
+_STEP = 1 / 480
+_FRICTION_SLOPE = 100.0  # N s/m; its default of 1000 is unstable for four feet at this step
+_SOLVERS = {
+    "semi-implicit": newton.solvers.SolverSemiImplicit,
+    "featherstone": newton.solvers.SolverFeatherstone,
+    "XPBD": newton.solvers.SolverXPBD,
+}
+wp.config.quiet = True
+
+
+@wp.kernel
+def _read(poses: wp.array(dtype=wp.transform), body: int, axis: int, out: wp.array(dtype=float)):
+    out[0] = wp.transform_get_translation(poses[body])[axis]
+
+
+def _build(scene: Scene) -> newton.ModelBuilder:
+    gravity = 0.0 if scene["name"] == "push" else -9.81
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, gravity))
+    if "balls" not in scene:
+        builder.add_mjcf(scene["xml"])
+        return builder
+    look = newton.ModelBuilder.ShapeConfig(density=0.0, ke=scene["stiffness"], kd=scene["damping"], kf=_FRICTION_SLOPE)
+    look.mu, look.restitution = scene["friction"], scene["restitution"]
+    solid = wp.diag(wp.vec3(scene["inertia"], scene["inertia"], scene["inertia"]))
+    for start in scene["starts"]:
+        body = builder.add_body(xform=_at(start), mass=scene["mass"], inertia=solid)
+        for place in scene["balls"]:
+            builder.add_shape_sphere(body, xform=_at(place), radius=scene["radius"], cfg=look)
+    for place, size in scene["sides"]:
+        builder.add_shape_sphere(-1, xform=_at(place), radius=size, cfg=look)
+    if scene["floor"]:
+        builder.add_ground_plane(cfg=look)
+    return builder
+
+
+def _at(place: list[float]) -> wp.transform:
+    return wp.transform(wp.vec3(*map(float, place)), wp.quat_identity())
+
+
+def make(scene: Scene, variant: str) -> Pair:
+    """Tape one rollout; states are kept from call to call."""
+    model = _build(scene).finalize(device="cpu", requires_grad=True)
+    solver = _SOLVERS[variant](model, **({"enable_restitution": True} if variant == "XPBD" else {}))
+    steps, out = round(scene["duration"] / _STEP), wp.zeros(1, dtype=float, requires_grad=True, device="cpu")
+    states, control = [model.state() for _ in range(steps + 1)], model.control()
+    pipeline = newton.CollisionPipeline(model, broad_phase="explicit", requires_grad=True)
+    contacts = [pipeline.contacts() for _ in range(steps)]
+    first, (kind, index) = states[0], scene["vary"]
+    varied = {"qpos": first.joint_q, "qvel": first.joint_qd, "ctrl": control.joint_f}[kind]
+    base = varied.numpy().copy()
+    body, axis = (1, 0) if scene["name"] == "push" else (0, scene["read"])
+
+    def run(value: float) -> float:
+        start = base.copy()
+        start[index] += value
+        varied.assign(start)
+        newton.eval_fk(model, first.joint_q, first.joint_qd, first)
+        for before, after, contact in zip(states, states[1:], contacts, strict=False):
+            before.clear_forces()
+            pipeline.collide(before, contact)
+            solver.step(before, after, control, contact, _STEP)
+        wp.launch(_read, dim=1, inputs=[states[-1].body_q, body, axis, out], device="cpu")
+        return float(out.numpy()[0])
+
+    def gradient(value: float) -> tuple[float, float]:
+        with wp.Tape() as tape:
+            found = run(value)
+        tape.backward(out)
+        derivative = float(varied.grad.numpy()[index])
+        tape.zero()
+        return found, derivative
+
+    return gradient, run
+
+
+if __name__ == "__main__":
+    serve(make)
