@@ -2,21 +2,16 @@
 
 import dataclasses
 import functools
-import time
-import tracemalloc
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from timeit import timeit
 from typing import Annotated, Any, Literal
 
 import jax
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 from pydantic import Field
 
-from experiments.parallel import num_compilers
-from experiments.problems.left_out import ONLY_GRADIENT, PARTS, PartName, SceneName, file_of, is_left_out, program
+from experiments.problems import left_out
+from experiments.problems.left_out import ONLY_GRADIENT, PARTS, PartName, SceneName
 from experiments.report import Table
 from experiments.settings import RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, ZEROTH, Drawings, legend_below, plain, subplots
@@ -27,6 +22,7 @@ from mjxgrad.stepping import EngineName
 _Count = Annotated[int, Field(ge=2)]
 _ROUNDING = 100.0  # times what four roundings of the start make of a result: within that two programs give the same
 _LEAST = 1.1  # a factor that counts
+_TOGETHER = ("all", "mjx.step")
 _TITLES: dict[EngineName, str] = {"mjx": "MJX", "mujoco": "C MuJoCo"}
 
 
@@ -114,36 +110,29 @@ def of_scene(name: SceneName, settings: Settings) -> list[Cost]:
     sizes, costs = settings.sizes, []
     by: dict[EngineName, tuple] = {"mjx": (sizes.scenes[name], sizes.batch), "mujoco": (PARTS, sizes.few)}
     for engine, (chosen, count) in by.items():
-        keys = [key for key in chosen if is_left_out(key, name, engine)]
+        keys = [key for key in chosen if left_out.is_left_out(key, name, engine)]
         # Room is what `load_scene` keeps, unless it is told otherwise.
-        variants = {"": []} | {k: [PARTS[k]] for k in keys} | {"all": [PARTS[k] for k in keys if k != "room"]}
+        variants = {"": []} | {k: [PARTS[k]] for k in keys}
+        variants |= {"all": [PARTS[k] for k in keys if k != "room"]} if len(keys) > 2 else {}
         variants |= {"mjx.step": [PARTS["mjx.step"]]} if engine == "mjx" else {}
-        starts = _starts(file_of(name).compile(), count, sizes.horizon, settings.seed)
+        starts = left_out.starts_of(left_out.file_of(name).compile(), count, sizes.horizon, settings.seed)
         for work in ("forward", "gradient"):
             own = {k: v for k, v in variants.items() if work == "gradient" or k not in ONLY_GRADIENT}
             costs += _compare(name, engine, work, own, starts, sizes.repeats)
     return costs
 
 
-def _starts(model: mujoco.MjModel, count: int, horizon: int, seed: int) -> tuple[jax.Array, ...]:
-    """Return states that have fallen for a while and are stirred a little, and controls within half of their range."""
-    data, random = mujoco.MjData(model), np.random.default_rng(seed)
-    mujoco.mj_step(model, data, round(0.3 / model.opt.timestep))
-    low, high = np.where(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange.T, [[-1.0], [1.0]])
-    ctrl = (low + high) / 2 + 0.25 * (high - low) * random.uniform(-1, 1, (count, horizon, model.nu))
-    qvel = data.qvel + 0.2 * random.normal(size=(count, model.nv))
-    return jnp.asarray(np.tile(data.qpos, (count, 1))), jnp.asarray(qvel), jnp.asarray(ctrl)
-
-
 def _compare(name: str, engine: EngineName, work: str, variants: dict, starts: tuple, repeats: int) -> list[Cost]:
     """Let programs take turns, and compare what they take and give with the first one, which leaves all out."""
-    with ThreadPoolExecutor(num_compilers()) as pool:
-        traced = {key: program(name, parts, engine, work, starts) for key, parts in variants.items()}
-        made = {key: pool.submit(one.compiled) for key, one in traced.items() if one is not None}
-    made = {key: future.result() for key, future in made.items()}
+    traced = {key: left_out.program(name, parts, engine, work, starts) for key, parts in variants.items()}
+    made = {key: one.compiled() for key, one in traced.items() if one is not None}  # one by one: that takes no longer
     results = {key: _numbers(run(*starts)) for key, (run, *_) in made.items()}
-    turns = [{key: _seconds(run, starts) for key, (run, *_) in made.items()} for _ in range(repeats)]
-    memory = {key: size + (_peak(run, starts) if engine == "mujoco" else 0) for key, (run, _, size) in made.items()}
+    turns = [
+        {k: timeit(functools.partial(run, *starts), number=1) for k, (run, *_) in made.items()} for _ in range(repeats)
+    ]
+    memory = {
+        key: size + (left_out.peak(run, *starts) if engine == "mujoco" else 0) for key, (run, _, size) in made.items()
+    }
     signs = [np.random.default_rng(k).choice([-1.0, 1.0], x.shape) for k, x in enumerate(starts)]
     moved = (x * (1 + 4 * np.finfo(float).eps * sign) for x, sign in zip(starts, signs, strict=True))
     scale, rounded = np.abs(results[""]).max(), _numbers(made[""][0](*moved))
@@ -163,47 +152,27 @@ def _numbers(result: Any) -> np.ndarray:
     return np.concatenate([np.asarray(leaf, float).ravel() for leaf in jax.tree.leaves(result[0])])
 
 
-def _seconds(run: Callable, starts: tuple) -> float:
-    began = time.perf_counter()
-    run(*starts)
-    return time.perf_counter() - began
-
-
-def _peak(run: Callable, starts: tuple) -> float:
-    """Return the most bytes that arrays of numpy hold while a program runs."""
-    tracemalloc.start()
-    run(*starts)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return peak
-
-
 def answer(outcome: Outcome) -> str:
     """Say which part buys most memory, and which most time."""
-    told = []
-    for word, factor in (("memory", lambda cost: cost.memory), ("time", lambda cost: cost.time[1])):
-        best = max(_single(outcome), key=factor)
-        told.append(f"{PARTS[best.part].what}: {_times(factor(best))} {word} ({best.scene}, {_TITLES[best.engine]})")
-    return "; ".join(told) + "."
+    memory = max(_single(outcome), key=lambda cost: cost.memory)
+    took = max(_single(outcome), key=lambda cost: cost.time[1])
+    told = ((memory, memory.memory, "memory"), (took, took.time[1], "time"))
+    return "; ".join(f"{PARTS[c.part].what}: {factor:.3g}× {word} ({c.scene})" for c, factor, word in told) + "."
 
 
 def verdict(outcome: Outcome) -> str:
     """Say what all parts cost together, and which cost nothing."""
-    told = []
-    for engine, title in _TITLES.items():
-        spans = []
+    told, single = [], _single(outcome)
+    for engine, part, title in (("mjx", "all", "MJX"), ("mujoco", "all", "C MuJoCo"), ("mjx", "mjx.step", "mjx.step")):
         for work in ("forward", "gradient"):
-            factors = [c.time[1] for c in outcome.costs if (c.part, c.engine, c.work) == ("all", engine, work)]
-            spans += [f"{work} {_times(min(factors))} to {_times(max(factors))}"] if factors else []
-        told.append(f"{title}: {', '.join(spans)}")
-    single = _single(outcome)
-    found = [key for key in PARTS if any(c.part == key for c in single)]
-    idle = [k for k in found if all(c.time[0] < _LEAST and c.memory < _LEAST for c in single if c.part == k)]
-    helps = [f"{PARTS[c.part].what} on {c.scene}" for c in single if c.time[2] < 1 / _LEAST]
-    listed = joined([PARTS[key].what for key in idle] or ["nothing"])
+            factors = [c.time[1] for c in outcome.costs if (c.part, c.engine, c.work) == (part, engine, work)]
+            told += [f"{title}, {work}, {min(factors):.3g}× to {max(factors):.3g}×"] if factors else []
+    idle = {k for k in PARTS if all(c.time[0] < _LEAST and c.memory < _LEAST for c in single if c.part == k)}
+    idle = [PARTS[k].what for k in PARTS if k in idle and any(c.part == k for c in single)]
+    helps = dict.fromkeys(f"{PARTS[c.part].what} on {c.scene}" for c in single if c.time[2] < 1 / _LEAST)
     return (
-        f"Time with all of it put back, by scene: {'; '.join(told)}. {listed.capitalize()} costs nothing anywhere. "
-        f"Faster with than without: {joined(dict.fromkeys(helps)) if helps else 'nothing'}."
+        f"Time with all of it put back, by scene: {'; '.join(told)}. Costs nothing anywhere: {joined(idle or ['nothing'])}. "
+        f"Faster with than without: {joined(helps or ['nothing'])}."
     )
 
 
@@ -212,21 +181,17 @@ def findings(outcome: Outcome) -> list[str]:
     told = []
     for key in dict.fromkeys(c.part for c in outcome.costs if not c.is_same):
         costs = [c for c in outcome.costs if c.part == key and not c.is_same]
-        why, worst = PARTS[key].off or "those of its parts", max(costs, key=lambda c: c.difference)
-        where = joined(dict.fromkeys(c.scene for c in costs))
-        told.append(
-            f"{PARTS[key].what}: results differ on {where} by up to {quantity(worst.difference)} of the largest ({why})."
-        )
-    told.append("All other results are the same to rounding. mjx.step has no gradient in reverse mode.")
-    return told
+        where, worst = joined(dict.fromkeys(c.scene for c in costs)), max(c.difference for c in costs)
+        why = f" ({PARTS[key].off})" if PARTS[key].off else ""
+        told.append(f"{PARTS[key].what}: results differ on {where}, by up to {quantity(worst)} of the largest{why}.")
+    found = {(c.scene, c.work) for c in outcome.costs if c.part == "mjx.step"}
+    lacks = [scene for scene, _ in found if (scene, "gradient") not in found]
+    told += [f"mjx.step has no gradient in reverse mode on {joined(sorted(lacks))}."] if lacks else []
+    return [*told, "All other results are the same to rounding."]
 
 
 def _single(outcome: Outcome) -> list[Cost]:
-    return [cost for cost in outcome.costs if cost.part not in ("all", "mjx.step")]
-
-
-def _times(factor: float) -> str:
-    return f"{factor:.3g}×"
+    return [cost for cost in outcome.costs if cost.part not in _TOGETHER]
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -246,12 +211,12 @@ def tables(outcome: Outcome) -> list[Table]:
             "scene",
             f"back into {title}",
             "why not",
-            *(f"{work}, {x}" for work in ("motion", "gradient") for x in parts),
+            *(f"{w}, {x}" for w in ("motion", "gradient") for x in parts),
         )
         caption = (
-            "Factors over the program without, which the row of all of these tells: time with quartiles over turns, bold where "
-            "these are above 1.1, memory beside arguments, compilation of two programs at a time. Differences over the largest "
-            f"result; * beyond rounding. {sizes.horizon} steps of {sizes.batch if engine == 'mjx' else sizes.few} rollouts."
+            "Factors over the program without, whose own numbers the last rows of a scene tell: time with quartiles over turns, "
+            "bold where these are above 1.1; memory beside arguments. Differences over the largest result; * beyond rounding. "
+            f"{sizes.horizon} steps of {sizes.batch if engine == 'mjx' else sizes.few} rollouts."
         )
         found.append(Table(columns, rows, caption, frozenset(emphasised)))
     return found
@@ -260,12 +225,12 @@ def tables(outcome: Outcome) -> list[Table]:
 def _cells(cost: Cost) -> list[str]:
     low, middle, high = (f"{x:.3g}" for x in cost.time)
     without = (
-        f" × {1e3 * cost.seconds:.3g} ms",
-        f" × {cost.num_bytes / 1e3:.3g} kB",
-        f" × {cost.compile_seconds:.2g} s",
+        f" of {1e3 * cost.seconds:.3g} ms",
+        f" of {cost.num_bytes / 1e3:.3g} kB",
+        f" of {cost.compile_seconds:.2g} s",
     )
     ratios = (f"{middle} ({low} to {high})", f"{cost.memory:.3g}", f"{cost.compilation:.2g}")
-    cells = [ratio + base * (cost.part == "all") for ratio, base in zip(ratios, without, strict=True)]
+    cells = [ratio + own * (cost.part in _TOGETHER) for ratio, own in zip(ratios, without, strict=True)]
     return [*cells, f"{cost.difference:.0e}".replace("-", "−") + " *" * (not cost.is_same)]
 
 

@@ -2,7 +2,9 @@
 
 import contextlib
 import functools
+import importlib
 import time
+import tracemalloc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +25,7 @@ from mjxgrad.engines import inverse
 from mjxgrad.engines.pool import pool_of
 from mjxgrad.engines.state import data_of
 from mjxgrad.scene.refusals import has_constraints
-from mjxgrad.stepping import EngineName, forward, rows
+from mjxgrad.stepping import EngineName, rows
 from mjxgrad.tasks import scene_path
 
 SceneName = Literal["cartpole", "ball_wall", "push", "falling_arm", "sensing_arm", "hopper", "ant", "quadruped"]
@@ -33,8 +35,9 @@ PartName = Literal[
 ]  # fmt: skip
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _MOST_PAIRS = 6
-_LITTLE = 1e-12  # of what must act, so that no step can know that it does next to nothing
+_LITTLE = 1e-25  # of what must act, so that no step can know that it does next to nothing
 _SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+_FORWARD = importlib.import_module("mjxgrad.stepping.forward")  # whose name in `stepping` is a function's
 _DIFFERENCES, _BEGIN = mujoco.mjd_inverseFD, inverse.Inverse.__init__
 
 
@@ -170,16 +173,16 @@ _FULL = {"keep_everything": True}
 _READ = {"observe": lambda _, data: jax.tree.leaves(data)}
 PARTS: dict[str, Part] = {
     "damping": Part(
-        "implicit damping", "no joint is damped", _X, load=_FULL, patch=_put(forward, "is_known_to_be", lambda *_: False)
+        "implicit damping", "no joint is damped", _X, load=_FULL, patch=_put(_FORWARD, "is_known_to_be", lambda *_: False)
     ),
     "storage": Part("sparse matrices", "small ones are faster dense", _X, load=_FULL),
-    "rows": Part("limits, friction loss, equality", "the file has none", edit=_with_rows, off="friction of 1e-12 N"),
-    "forces": Part("medium, tendon, motor", "the file has none", edit=_with_forces, off="a medium of 1e-12"),
-    "pairs": Part(f"{_MOST_PAIRS} pairs of geoms at most", "masks keep them apart", edit=_with_pairs),
+    "rows": Part("limits, friction loss, equality", "the file has none", edit=_with_rows),
+    "forces": Part("medium, tendon, motor", "the file has none", edit=_with_forces),
+    "pairs": Part(f"{_MOST_PAIRS} pairs of geoms", "masks keep them apart", edit=_with_pairs),
     "room": Part("room beyond 8 contacts", "max_contacts=8", _X, load={"max_contacts": 8}),
-    "cold": Part("a cold start of solves", "the last solution is near", edit=_cold, off="the solver's tolerance"),
+    "cold": Part("cold start of solves", "the last solution is near", edit=_cold, off="the solver's tolerance"),
     "columns": Part("columns of contacts", "joints that move neither body", _X, patch=_put(rows, "_bodies", _unknown)),
-    "record": Part("a record of all data", "nobody reads it", _X, rollout=_READ),
+    "record": Part("record of all data", "nobody reads it", _X, rollout=_READ),
     "carry": Part("all data between steps", "the state decides", _X, step=mg.step),
     "values": Part("values within steps", "a gradient computes them anew", _X, rollout={"checkpoint": False}),
     "numbers": Part("numbers as arguments", "they are known", is_argument=True),
@@ -193,8 +196,8 @@ PARTS: dict[str, Part] = {
     "geoms": Part(
         "collisions of geoms apart", "they stay apart", _C, patch=_put(inverse.Inverse, "__init__", _with_all_geoms)
     ),
-    "all": Part("all of these", ""),
-    "mjx.step": Part("all (mjx.step)", "", _X, step=mjx.step, off="the solver's tolerance"),
+    "all": Part("all of these", "as above"),
+    "mjx.step": Part("all (mjx.step)", "MJX's own step", _X, step=mjx.step, off="the solver's tolerance"),
 }  # fmt: skip
 ONLY_GRADIENT = {"values", "solution", "stages", "geoms"}
 
@@ -204,6 +207,16 @@ def is_left_out(key: str, name: str, engine: EngineName) -> bool:
     file, has_inverse = file_of(name), inverse.has_inverse(file_of(name).compile())
     is_told = key not in ("all", "mjx.step") and engine in PARTS[key].engines and PARTS[key].edit(file)
     return is_told and (has_inverse or engine == "mjx" or key not in ONLY_GRADIENT)
+
+
+def starts_of(model: mujoco.MjModel, count: int, horizon: int, seed: int) -> tuple[jax.Array, ...]:
+    """Return states that have fallen for a while and are stirred a little, and controls within half of their range."""
+    data, random = mujoco.MjData(model), np.random.default_rng(seed)
+    mujoco.mj_step(model, data, round(0.3 / model.opt.timestep))
+    low, high = np.where(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange.T, [[-1.0], [1.0]])
+    ctrl = (low + high) / 2 + 0.25 * (high - low) * random.uniform(-1, 1, (count, horizon, model.nu))
+    qvel = data.qvel + 0.2 * random.normal(size=(count, model.nv))
+    return jnp.asarray(np.tile(data.qpos, (count, 1))), jnp.asarray(qvel), jnp.asarray(ctrl)
 
 
 def _function(parts: Sequence[Part], work: str) -> Callable[..., Any]:
@@ -284,3 +297,12 @@ def program(name: str, parts: Sequence[Part], engine: EngineName, work: str, sta
                 raise
             return None
         return Program(lowered, given, parts, time.perf_counter() - began)
+
+
+def peak(run: Callable, *starts: jax.Array) -> float:
+    """Return the most bytes that arrays of numpy hold while a program runs."""
+    tracemalloc.start()
+    run(*starts)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak

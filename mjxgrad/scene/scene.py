@@ -320,6 +320,7 @@ def _left_out(scene: Scene) -> Iterator[tuple[str, str]]:
     size, every = model.nq + 2 * model.nv + model.na + 1, sum(np.size(x) for x in jax.tree.leaves(scene.data))
     yield "data between steps", f"a rollout carries {size} of {every} numbers; observe= keeps more"
     yield "values within steps", "a gradient computes them anew; checkpoint=False keeps them"
+    yield "numbers of the model", "the compiler knows them, unless the scene is an argument of jax.jit"
     kinds = ((model.nsensor, "sensors"), (model.ncam, "cameras"), (model.nlight, "lights"))
     if unread := [name for count, name in kinds if count]:
         yield ", ".join(unread), "they move nothing; computed only where observe= reads them"

@@ -5,37 +5,43 @@ import pytest
 from experiments import ablation
 from experiments.ablation import Cost, Outcome, Settings, Sizes, answer, drawings, findings, tables, verdict
 from experiments.problems import left_out
-from experiments.problems.left_out import ONLY_GRADIENT, PARTS, file_of, is_left_out, program
+from experiments.problems.left_out import ONLY_GRADIENT, PARTS, file_of, is_left_out, program, starts_of
 
 _SIZES = Sizes(scenes={"sensing_arm": ("rows",)}, batch=2, few=2, horizon=3, repeats=2)
 _SETTINGS = Settings(experiment="ablation", sizes=_SIZES)
 
 
-@pytest.fixture(scope="module")
-def starts():
-    return ablation._starts(file_of("sensing_arm").compile(), 2, 3, 0)
+def _starts(name):
+    return starts_of(file_of(name).compile(), 2, 3, 0)
 
 
-def _text(key, work, starts):
-    parts = [PARTS[key]] if key else []
-    return program("sensing_arm", parts, "mjx", work, starts).lowered.as_text()
+_OF_MOTION = ["storage", "rows", "forces", "cold", "columns", "record", "carry", "numbers", "mjx.step"]
 
 
-@pytest.mark.parametrize("work", ["forward", "gradient"])
-def test_each_part_put_back_makes_another_program(work, starts):
+@pytest.mark.parametrize(
+    ("name", "work", "keys"),
+    [
+        ("sensing_arm", "forward", _OF_MOTION),
+        ("sensing_arm", "gradient", ["values"]),
+        ("ball_wall", "forward", ["damping"]),
+    ],
+)
+def test_each_part_put_back_makes_another_program(name, work, keys):
     """Equal text would be a part that is not put back, and a measured factor of nothing."""
-    keys = ["rows", "cold", "columns", "record", "carry", "numbers", "mjx.step"] if work == "forward" else ["values"]
-    texts = [_text(key, work, starts) for key in ["", *keys]]
+    parts = [[], *([PARTS[key]] for key in keys)]
+    texts = [program(name, one, "mjx", work, _starts(name)).lowered.as_text() for one in parts]
     assert len(set(texts)) == len(texts)
 
 
-def test_c_mujoco_gives_the_same_gradient_with_parts_put_back(monkeypatch, starts):
+def test_c_mujoco_gives_the_same_gradient_with_parts_put_back(monkeypatch):
     """Columns by velocity that compute every stage are differences of one side, of the same width: equal to rounding over it."""
     begun = []
     monkeypatch.setattr(left_out, "_BEGIN", lambda *a, own=left_out._BEGIN: begun.append(1) or own(*a))
     keys = [key for key in PARTS if key in ONLY_GRADIENT and is_left_out(key, "sensing_arm", "mujoco")]
     assert keys == ["solution", "stages", "geoms"]
-    costs = ablation._compare("sensing_arm", "mujoco", "gradient", {"": []} | {k: [PARTS[k]] for k in keys}, starts, 2)
+    costs = ablation._compare(
+        "sensing_arm", "mujoco", "gradient", {"": []} | {k: [PARTS[k]] for k in keys}, _starts("sensing_arm"), 2
+    )
     assert begun
     differences = {cost.part: cost.difference for cost in costs}
     assert differences["geoms"] == 0.0
@@ -81,12 +87,10 @@ def _outcome():
 
 def test_the_page_names_the_largest_factors_and_what_hurts():
     outcome = _outcome()
-    assert (
-        answer(outcome) == "columns of contacts: 6× memory (hopper, MJX); columns of contacts: 3× time (hopper, MJX)."
-    )
+    assert answer(outcome) == "columns of contacts: 6× memory (hopper); columns of contacts: 3× time (hopper)."
     assert len(answer(outcome).split()) <= 15
     assert "Faster with than without: values within steps on hopper." in verdict(outcome)
-    assert "a cold start of solves: results differ on hopper" in findings(outcome)[0]
+    assert "cold start of solves: results differ on hopper" in findings(outcome)[0]
     by_mjx = tables(outcome)[0]
     assert by_mjx.emphasised == {(1, 3), (2, 3), (3, 3), (3, 7)}
 
