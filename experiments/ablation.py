@@ -21,8 +21,7 @@ from mjxgrad.stepping import EngineName
 
 _Count = Annotated[int, Field(ge=2)]
 _ROUNDING = 100.0  # times what four roundings of the start make of a result: within that two programs give the same
-_LEAST = 1.1  # a factor that counts
-_TOGETHER = ("all", "mjx.step")
+_LEAST, _TOGETHER = 1.1, ("all", "mjx.step")  # a factor that counts; parts that are no single ones
 _TITLES: dict[EngineName, str] = {"mjx": "MJX", "mujoco": "C MuJoCo"}
 
 
@@ -124,8 +123,8 @@ def of_scene(name: SceneName, settings: Settings) -> list[Cost]:
 
 def _compare(name: str, engine: EngineName, work: str, variants: dict, starts: tuple, repeats: int) -> list[Cost]:
     """Let programs take turns, and compare what they take and give with the first one, which leaves all out."""
-    traced = {key: left_out.program(name, parts, engine, work, starts) for key, parts in variants.items()}
-    made = {key: one.compiled() for key, one in traced.items() if one is not None}  # one by one: that takes no longer
+    traced = ((key, left_out.program(name, parts, engine, work, starts)) for key, parts in variants.items())
+    made = {key: one.compiled() for key, one in traced if one is not None}  # one by one: two at a time take as long
     results = {key: _numbers(run(*starts)) for key, (run, *_) in made.items()}
     turns = [
         {k: timeit(functools.partial(run, *starts), number=1) for k, (run, *_) in made.items()} for _ in range(repeats)
@@ -244,14 +243,8 @@ def factors(outcome: Outcome):
     scenes = list(dict.fromkeys(cost.scene for cost in outcome.costs))
     keys = {e: [k for k in PARTS if any((c.part, c.engine) == (k, e) for c in outcome.costs)] for e in _TITLES}
     heights = [len(keys[engine]) + 1 for engine in keys]
-    figure, axes = subplots(
-        2,
-        len(scenes),
-        height=0.27 * sum(heights) + 1.4,
-        sharex=True,
-        sharey="row",
-        gridspec_kw={"height_ratios": heights},
-    )
+    shape = {"height": 0.27 * sum(heights) + 1.4, "sharex": True, "sharey": "row"}
+    figure, axes = subplots(2, len(scenes), **shape, gridspec_kw={"height_ratios": heights})
     for row, (engine, title) in zip(axes, _TITLES.items(), strict=True):
         for axis, scene in zip(row, scenes, strict=True):
             axis.axvline(1, color=MUTED, lw=0.8)
@@ -260,15 +253,8 @@ def factors(outcome: Outcome):
                 places = np.array([keys[engine].index(key) for key in own]) + shift
                 ends = np.array([cost.time[1] for cost in own.values()])
                 axis.barh(places, ends - 1, 0.38, left=1, color=colour, label=f"time, {work}")
-                axis.plot(
-                    [c.memory for c in own.values()],
-                    places,
-                    "D",
-                    mfc="white",
-                    mec=colour,
-                    ms=4,
-                    label=f"memory, {work}",
-                )
+                look = {"mfc": "white", "mec": colour, "ms": 4, "label": f"memory, {work}"}
+                axis.plot([cost.memory for cost in own.values()], places, "D", **look)
             axis.set(xscale="log", title=scene.replace("_", " ") if engine == "mjx" else "")
             plain(axis.xaxis)
         row[0].set_yticks(range(len(keys[engine])), [PARTS[key].what for key in keys[engine]])
