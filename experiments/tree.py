@@ -18,7 +18,6 @@ from experiments.report import Table
 from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
 from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.video import film, shown_speed
-from experiments.words import capitalised
 from experiments.workspace import Workspace
 from mjxgrad.planning import Exact, GoalCost, Sampled, SceneSystem, Tree, optimise_trajectory
 from mjxgrad.tasks import scene_path
@@ -156,6 +155,7 @@ def _block() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
         raise ExperimentError(f"the hand of gymnasium-robotics could not be downloaded: {error}") from error
     spec = mujoco.MjSpec.from_file(str(folder / "manipulate_block.xml"))
     spec.delete(spec.joint("target:joint"))  # the goal of gymnasium's own tasks is a free body that falls
+    spec.body("target").pos = [1.1, 0.8, 0.2]
     spec.worldbody.add_camera(name="above", pos=[0.855, 0.649, 0.515], quat=[0.908, 0.331, -0.089, -0.243])
     data = mujoco.MjData(model := spec.compile())
     data.ctrl[:] = [0.5 * (model.actuator(i).name[-3:] in ("FJ2", "FJ1")) for i in range(model.nu)]
@@ -199,7 +199,7 @@ def _attempt(problem: Problem, sizes: Sizes, tree: Tree | None, arm: str, seed: 
 def answer(outcome: Outcome) -> str:
     """Count the seeds from which each arm turns the body."""
     counts = (f"{arm} {len(outcome.of(arm, solved=True))} of {len(outcome.of(arm))}" for arm in ARMS)
-    return capitalised(", ".join(counts)) + "."
+    return ", ".join(counts).capitalize() + "."
 
 
 def verdict(outcome: Outcome) -> str:
@@ -210,15 +210,15 @@ def verdict(outcome: Outcome) -> str:
         nodes, seconds, angle = np.median(good, axis=0) if good else np.zeros(3)
         searched = f" after {nodes:.0f} nodes and {seconds:.1f} s" if arm != ALONE else ""
         told = f"{len(good)} seeds{searched} to {angle:.2g}° (medians)" if good else "no seed"
-        said.append(f"{capitalised(arm)} turns the body from {told}.")
+        said.append(f"{arm.capitalize()} turns the body from {told}.")
     return " ".join(said)
 
 
 def findings(outcome: Outcome) -> list[str]:
     """Say what counts, and how far trajectory optimisation comes."""
     off = [one.angle_error for one in outcome.of(ALONE)]
-    counts = "What counts is the replay of the controls by plain C MuJoCo, from the start to the last time step."
-    return [counts, f"Trajectory optimisation alone ends {min(off):.2g} to {max(off):.3g}° from the goal."]
+    counts = "What counts is the replay of the controls by plain C MuJoCo"
+    return [f"{counts}; trajectory optimisation alone ends {min(off):.2g} to {max(off):.3g}° from the goal."]
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -270,8 +270,6 @@ def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tupl
     shown, problem = _shown(outcome), Problem(outcome.settings)
     model, target = copy.copy(problem.model), problem.model.body("target").id
     model.body_quat[target] = [np.cos(problem.angle / 2), 0, 0, np.sin(problem.angle / 2)]
-    if outcome.settings.hand == "shadow":
-        model.body_pos[target] = [1.1, 0.8, 0.2]
     rest = np.repeat(shown.states[-1:], int(wanted.speed / model.opt.timestep), axis=0)
     motion = np.concatenate([shown.states, rest])[:, : model.nq]
     caption = f"The path of seed {shown.seed}, replayed by C MuJoCo, {shown_speed(wanted.speed)}; beside it the goal."

@@ -9,7 +9,15 @@ from scipy.stats import norm
 
 import mjxgrad as mg
 from mjxgrad.engines.pool import Pool
-from mjxgrad.planning import Analytic, FunctionSystem, Sampled, SceneSystem
+from mjxgrad.planning import (
+    Analytic,
+    Exact,
+    FunctionSystem,
+    GoalCost,
+    Sampled,
+    SceneSystem,
+    optimise_trajectory,
+)
 from mjxgrad.stepping import Smoothing
 
 A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
@@ -178,3 +186,19 @@ def test_all_samples_of_c_mujoco_are_one_call(key, monkeypatch, order, asked):
     system = SceneSystem(mg.load_scene(FREE, engine="mujoco"))
     eqx.filter_jit(Sampled(0.1, 0.1, 20, order).linear_model)(system, system.origin, CONTROL, key)
     assert counts == asked
+
+
+def shove(state, control):
+    """A finger goes where it is told, and pushes a box ahead of it that is 0.1 m wide."""
+    finger = state[0] + control[0]
+    return jnp.stack([finger, jnp.maximum(state[1], finger + 0.1)])
+
+
+def test_samples_plan_a_push_from_where_nothing_touches(key):
+    """Without smoothing no iteration moves the finger, which is 0.3 m from the box."""
+    system, start = FunctionSystem(shove, 2, 1), jnp.array([-0.4, 0.0])
+    cost = GoalCost(jnp.array([0.0, 0.5]), 0.0, jnp.array([0.0, 1.0]), 1e-3)
+    given = system, cost, start, jnp.zeros((6, 1)), key
+    assert not optimise_trajectory(*given, smoother=Exact(), schedule=jnp.ones(3)).controls.any()
+    plan = optimise_trajectory(*given, smoother=Sampled(0.2, 0.2, 60), schedule=jnp.geomspace(1, 0.05, 20))
+    assert abs(plan.states[-1, 1] - 0.5) < 0.02
