@@ -215,9 +215,9 @@ def cell(engine: str, answer: dict[str, Any], precision: str = "float64") -> Cel
     errors = relative if is_finite.all() else [math.inf, math.nan, math.nan]
     times = [np.quantile(answer[one], [0.5, 0.25, 0.75]).tolist() for one in ("gradient_seconds", "rollout_seconds")]
     numbers = len(found), int(is_finite.sum()), float(outcomes.mean()), slope, float(compared.slope_error)
-    return Cell(
-        answer["scene"], engine, answer["variant"], *numbers, *errors, *map(tuple, times), answer["compile_seconds"]
-    )
+    named = answer["scene"], engine, answer["variant"]
+    parts: tuple[Any, ...] = (*named, *numbers, *errors, *map(tuple, times), answer["compile_seconds"])
+    return Cell(*parts)
 
 
 def _machine() -> str:
@@ -238,13 +238,10 @@ def answer(outcome: Outcome) -> str:
 def verdict(outcome: Outcome) -> str:
     """Name the fastest right gradient of each scene, and how often each contestant is right."""
     names = outcome.settings.sizes.scenes
-    told = [
-        f"{scene}: {f'{one.label} ({one.brief})' if (one := outcome.soonest(scene)) else 'nobody'}" for scene in names
-    ]
-    scenes_of, right = (
-        Counter(cell.label for cell in outcome.cells if cell.is_right or not only) for only in (False, True)
-    )
-    most = [f"{label} in {count} of {scenes_of[label]}" for label, count in right.most_common()]
+    found = [(scene, outcome.soonest(scene)) for scene in names]
+    told = [f"{scene}: {f'{one.label} ({one.brief})' if one else 'nobody'}" for scene, one in found]
+    count_of, right = (Counter(one.label for one in outcome.cells if one.is_right or every) for every in (True, False))
+    most = [f"{label} in {count} of {count_of[label]}" for label, count in right.most_common()]
     return (
         f"The fastest gradient within {percent(_RIGHT)} of the slope of its engine's own outcome, by scene: {'; '.join(told)}. "
         f"Right are {', '.join(most) or 'none'}."
@@ -269,30 +266,21 @@ def tables(outcome: Outcome) -> list[Table]:
         f"{percent(_RIGHT)}. Outcomes: {questions}."
     )
     columns = (
-        "scene",
-        "contestant",
-        "outcome (m)",
-        "slope",
-        "error",
-        "scatter",
-        "finite",
-        "gradient (ms)",
-        "rollout (ms)",
+        "scene, contestant, outcome (m), slope, error, scatter, finite, gradient (ms), rollout (ms), first call (s)"
     )
     rows = []
     for cell in sorted(outcome.cells, key=lambda cell: names.index(cell.scene)):
         times = [f"{1e3 * m:.3g} ({1e3 * a:.3g} to {1e3 * b:.3g})" for m, a, b in (cell.seconds, cell.rollout_seconds)]
-        numbers = (
+        numbers = [
             quantity(cell.outcome),
             quantity(cell.slope, cell.slope_error),
             cell.told_error,
             quantity(cell.scatter),
-        )
-        counts = f"{cell.num_finite} of {cell.num_starts}"
-        rows.append([cell.scene, cell.label, *numbers, counts, *times, f"{cell.compile_seconds:.1f}"])
+        ]
+        numbers += [f"{cell.num_finite} of {cell.num_starts}", *times, f"{cell.compile_seconds:.1f}"]
+        rows.append([cell.scene, cell.label, *numbers])
     about = "Errors with their standard errors, and scatter of single derivatives, over the slope. Times: median and quartiles."
-    every = Table((*columns, "first call (s)"), rows, about)
-    return [Table(("contestant", *names), short, caption, frozenset(places)), every]
+    return [Table(("contestant", *names), short, caption, frozenset(places)), Table(columns.split(", "), rows, about)]
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -309,17 +297,13 @@ def error_against_time(outcome: Outcome):
         axis.axis("off")
     for axis, name in zip(axes.flat, names, strict=False):
         for cell in (cell for cell in outcome.cells if cell.scene == name):
-            look = {
-                "color": colours[cell.engine],
-                "marker": MARKERS[ENGINES[cell.engine]["variants"].index(cell.variant)],
-            }
+            look = {"color": colours[cell.engine], "label": cell.label}
+            marker = MARKERS[ENGINES[cell.engine]["variants"].index(cell.variant)]
             ends = np.clip([cell.error - cell.standard_error, cell.error + cell.standard_error], _LOW, _HIGH)
             axis.plot([cell.seconds[0]] * 2, ends, color=look["color"], lw=0.8, alpha=0.5)
-            axis.plot(cell.seconds[0], np.clip(cell.error, _LOW, _HIGH), ls="", ms=6, label=cell.label, **look)
+            axis.plot(cell.seconds[0], np.clip(cell.error, _LOW, _HIGH), ls="", ms=6, marker=marker, **look)
         axis.axhline(_RIGHT, color=MUTED, lw=0.8, ls=(0, (3, 2)))
-        axis.set(
-            xscale="log", yscale="log", title=name, ylim=(_LOW / 1.6, _HIGH * 1.6), xlabel="seconds of one gradient"
-        )
+        axis.set(xscale="log", yscale="log", title=name, ylim=(_LOW / 1.6, _HIGH * 1.6), xlabel="seconds of a gradient")
         plain(axis.xaxis)
     for axis in axes[:, 0]:
         axis.set_ylabel("error over slope")

@@ -1,5 +1,7 @@
 """brax's generalised, positional and spring pipelines, with the time steps of its own environments."""
 
+# pyright: reportMissingImports=false
+
 from pathlib import Path
 
 import brax
@@ -16,7 +18,7 @@ _PIPELINES = {"generalized": generalized, "positional": positional, "spring": sp
 
 def make(scene: Scene, variant: str) -> Pair:
     """Roll out a pipeline in a scan; the hopper is brax's file of it, whose constants its pipelines need."""
-    own = Path(brax.__file__).parent / "envs/assets/hopper.xml"
+    own = Path(str(brax.__file__)).parent / "envs/assets/hopper.xml"
     system = mjcf.loads(own.read_text() if scene["name"] == "hopper" else scene["xml"])
     pipeline = _PIPELINES[variant]
     steps = round(scene["duration"] / float(system.opt.timestep))

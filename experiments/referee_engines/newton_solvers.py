@@ -1,13 +1,12 @@
-"""Newton's differentiable solvers on a CPU, taped by Warp, with the step of its own differentiable example (1/480 s).
+"""Newton's differentiable solvers on a CPU, taped by Warp, in single precision, at the step of its own examples."""
 
-Contacts are found anew at each step. All numbers are in single precision, the only one that there is.
-"""
+# pyright: reportMissingImports=false
 
 import newton
 import warp as wp
 from protocol import Pair, Scene, serve
 
-_STEP = 1 / 480
+_STEP = 1 / 480  # s
 _FRICTION_SLOPE = 100.0  # N s/m; its default of 1000 is unstable for four feet at this step
 _SOLVERS = {
     "semi-implicit": newton.solvers.SolverSemiImplicit,
@@ -18,19 +17,23 @@ wp.config.quiet = True
 
 
 @wp.kernel
-def _read(poses: wp.array(dtype=wp.transform), body: int, axis: int, out: wp.array(dtype=float)):
+def _read(poses: wp.array(dtype=wp.transform), body: int, axis: int, out: wp.array(dtype=float)):  # pyright: ignore
     out[0] = wp.transform_get_translation(poses[body])[axis]
 
 
+def _at(place: list[float]) -> wp.transform:
+    return wp.transform(wp.vec3(*map(float, place)), wp.quat_identity())
+
+
 def _build(scene: Scene) -> newton.ModelBuilder:
-    gravity = 0.0 if scene["name"] == "push" else -9.81
-    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, gravity))
+    gravity = (0.0, 0.0, 0.0 if scene["name"] == "push" else -9.81)
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=gravity)
     if "balls" not in scene:
         builder.add_mjcf(scene["xml"])
         return builder
     look = newton.ModelBuilder.ShapeConfig(density=0.0, ke=scene["stiffness"], kd=scene["damping"], kf=_FRICTION_SLOPE)
     look.mu, look.restitution = scene["friction"], scene["restitution"]
-    solid = wp.diag(wp.vec3(scene["inertia"], scene["inertia"], scene["inertia"]))
+    solid = wp.diag(wp.vec3(*[scene["inertia"]] * 3))
     for start in scene["starts"]:
         body = builder.add_body(xform=_at(start), mass=scene["mass"], inertia=solid)
         for place in scene["balls"]:
@@ -42,12 +45,8 @@ def _build(scene: Scene) -> newton.ModelBuilder:
     return builder
 
 
-def _at(place: list[float]) -> wp.transform:
-    return wp.transform(wp.vec3(*map(float, place)), wp.quat_identity())
-
-
 def make(scene: Scene, variant: str) -> Pair:
-    """Tape one rollout; states are kept from call to call."""
+    """Tape a rollout that finds contacts anew at each step; the states' arrays are kept from call to call."""
     model = _build(scene).finalize(device="cpu", requires_grad=True)
     solver = _SOLVERS[variant](model, **({"enable_restitution": True} if variant == "XPBD" else {}))
     steps, out = round(scene["duration"] / _STEP), wp.zeros(1, dtype=float, requires_grad=True, device="cpu")
@@ -56,12 +55,14 @@ def make(scene: Scene, variant: str) -> Pair:
     contacts = [pipeline.contacts() for _ in range(steps)]
     first, (kind, index) = states[0], scene["vary"]
     varied = {"qpos": first.joint_q, "qvel": first.joint_qd, "ctrl": control.joint_f}[kind]
-    base = varied.numpy().copy()
+    base, speeds = varied.numpy().copy(), first.joint_qd.numpy().copy()
+    speeds[0] = scene.get("speed", 0.0)
     body, axis = (1, 0) if scene["name"] == "push" else (0, scene["read"])
 
     def run(value: float) -> float:
         start = base.copy()
         start[index] += value
+        first.joint_qd.assign(speeds)
         varied.assign(start)
         newton.eval_fk(model, first.joint_q, first.joint_qd, first)
         for before, after, contact in zip(states, states[1:], contacts, strict=False):

@@ -1,5 +1,7 @@
 """nimblephysics: a complementarity problem each step, differentiated through its active set, at 1 ms, its default."""
 
+# pyright: reportMissingImports=false
+
 from typing import Any
 
 import nimblephysics as nimble

@@ -12,7 +12,19 @@ import pytest
 
 from experiments import referee
 from experiments.config import FOLDER, load_runs
-from experiments.referee import ENGINES, Outcome, answer, ask, cell, drawings, findings, scenes, tables, verdict
+from experiments.referee import (
+    ENGINES,
+    Outcome,
+    Settings,
+    answer,
+    ask,
+    cell,
+    drawings,
+    findings,
+    scenes,
+    tables,
+    verdict,
+)
 from experiments.workspace import Workspace
 
 # Prints as engines do, knows one scene and not the other; its second variant gets its derivatives wrong, its third NaN.
@@ -49,6 +61,12 @@ def answers(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cells(answers):
     return {one["variant"]: cell("brax", one) for one in answers[1:] if "error" not in one}
+
+
+def settings_of(*overrides):
+    (run,) = load_runs("referee", list(overrides))
+    assert isinstance(run.settings, Settings)
+    return run.settings
 
 
 def test_an_engine_answers_by_lines_whatever_it_prints(answers):
@@ -118,10 +136,8 @@ def test_an_engine_that_cannot_be_installed_costs_its_rows_alone(monkeypatch, tm
 
     monkeypatch.setattr(referee, "_CACHE", tmp_path)
     monkeypatch.setattr(referee.subprocess, "run", refuse)
-    (run,) = load_runs(
-        "referee", ['sizes.engines=["Drake", "nimble"]', 'sizes.scenes=["slide"]', "sizes.num_starts=32"]
-    )
-    outcome = referee.measure(run.settings, Workspace(tmp_path))
+    settings = settings_of('sizes.engines=["Drake", "nimble"]', 'sizes.scenes=["slide"]', "sizes.num_starts=32")
+    outcome = referee.measure(settings, Workspace(tmp_path))
     assert outcome.missing == [
         f"{name}: not installed: ERROR: No matching distribution found." for name in ("Drake", "nimble")
     ]
@@ -129,8 +145,8 @@ def test_an_engine_that_cannot_be_installed_costs_its_rows_alone(monkeypatch, tm
 
 
 def test_the_page_names_the_fastest_of_those_that_are_right(cells):
-    (run,) = load_runs(
-        "referee", ['sizes.scenes=["slide", "bounce"]', 'sizes.engines=["mjxgrad", "MJX-softened", "brax", "Drake"]']
+    settings = settings_of(
+        'sizes.scenes=["slide", "bounce"]', 'sizes.engines=["mjxgrad", "MJX-softened", "brax", "Drake"]'
     )
     right = cells["right"]
 
@@ -144,8 +160,8 @@ def test_the_page_names_the_fastest_of_those_that_are_right(cells):
         named("brax", "generalized", 0.001, cells["lost"]),
         named("MJX-softened", "soft", 0.001),  # right about another motion
     ]
-    versions = dict.fromkeys(run.settings.sizes.engines, "package 1")
-    outcome = Outcome(run.settings, entries, ["nimble LCP: no hopper: it loads no MJCF."], versions, "a machine")
+    versions = dict.fromkeys(map(str, settings.sizes.engines), "package 1")
+    outcome = Outcome(settings, entries, ["nimble LCP: no hopper: it loads no MJCF."], versions, "a machine")
     assert answer(outcome) == "Right within 10% and soonest: Drake in 1 and nobody in 1 of 2 scenes."
     assert "slide: Drake sap" in verdict(outcome)
     assert "bounce: nobody" in verdict(outcome)
@@ -161,5 +177,5 @@ def test_every_engine_has_a_program_and_pinned_versions():
     for engine in ENGINES.values():
         assert (FOLDER / "referee_engines" / f"{engine['program']}.py").is_file()
         assert all("==" in package for package in engine["requires"])
-    assert set(load_runs("referee", [])[0].settings.sizes.engines) == set(ENGINES)
+    assert set(settings_of().sizes.engines) == set(ENGINES)
     assert Path(referee._CACHE).parts[0] == ".cache"
