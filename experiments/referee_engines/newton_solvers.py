@@ -8,11 +8,7 @@ from protocol import Pair, Scene, serve
 
 _STEP = 1 / 480  # s
 _FRICTION_SLOPE = 100.0  # N s/m; its default of 1000 is unstable for four feet at this step
-_SOLVERS = {
-    "semi-implicit": newton.solvers.SolverSemiImplicit,
-    "featherstone": newton.solvers.SolverFeatherstone,
-    "XPBD": newton.solvers.SolverXPBD,
-}
+_SOLVERS = {"semi-implicit": newton.solvers.SolverSemiImplicit, "featherstone": newton.solvers.SolverFeatherstone}
 wp.config.quiet = True
 
 
@@ -32,7 +28,7 @@ def _build(scene: Scene) -> newton.ModelBuilder:
         builder.add_mjcf(scene["xml"])
         return builder
     look = newton.ModelBuilder.ShapeConfig(density=0.0, ke=scene["stiffness"], kd=scene["damping"], kf=_FRICTION_SLOPE)
-    look.mu, look.restitution = scene["friction"], scene["restitution"]
+    look.mu = scene["friction"]
     solid = wp.diag(wp.vec3(*[scene["inertia"]] * 3))
     for start in scene["starts"]:
         body = builder.add_body(xform=_at(start), mass=scene["mass"], inertia=solid)
@@ -48,7 +44,7 @@ def _build(scene: Scene) -> newton.ModelBuilder:
 def make(scene: Scene, variant: str) -> Pair:
     """Tape a rollout that finds contacts anew at each step; the states' arrays are kept from call to call."""
     model = _build(scene).finalize(device="cpu", requires_grad=True)
-    solver = _SOLVERS[variant](model, **({"enable_restitution": True} if variant == "XPBD" else {}))
+    solver = _SOLVERS[variant](model)
     steps, out = round(scene["duration"] / _STEP), wp.zeros(1, dtype=float, requires_grad=True, device="cpu")
     states, control = [model.state() for _ in range(steps + 1)], model.control()
     pipeline = newton.CollisionPipeline(model, broad_phase="explicit", requires_grad=True)
