@@ -29,8 +29,7 @@ PATH = np.array([[0.03, 0.10, 0.18, 0.33, 0.48, 0.62, 0.74, 0.82, 1.06, 1.36, 1.
 # Seconds without compilation on an RTX 3090, and the loss then (m²).
 PUBLISHED = {"Ostrich": (10.0, 0.074), "MJX": (900.0, 0.30), "Newton, semi-implicit": (1400.0, 1.25)}
 
-# A descent without its noise: when (s, without compilation) which loss (m²) was known, with the norm of its gradient or of the
-# estimate; the knots of least loss; and the seconds of compilation.
+# When (s, without compilation) which loss (m²) was known, with the norm of the estimated gradient; the knots of least loss.
 Descent = namedtuple("Descent", "seconds loss gradient_norm params compile_seconds")
 
 
