@@ -17,18 +17,6 @@ from mjxgrad.identification.result import Identification, Stopped
 from mjxgrad.identification.search import identify
 
 __all__ = [
-    "Identification",
-    "Parameter",
-    "Recording",
-    "Stopped",
-    "armature",
-    "damping",
-    "friction",
-    "friction_loss",
-    "gains",
-    "gear",
-    "identify",
-    "inertia",
-    "mass",
-    "softness",
-]
+    "Identification", "Parameter", "Recording", "Stopped", "armature", "damping", "friction", "friction_loss", "gains", "gear",
+    "identify", "inertia", "mass", "softness",
+]  # fmt: skip

@@ -41,6 +41,8 @@ _SHORT, _FITS, _SETTLED = 1.0, (1.3, MISFIT**2), 1.5
 _CLEAR = 1e-10  # of the largest variance
 _SIZES = np.geomspace(1e-6, 1.0, 81)  # of the noise, where it is not known, over the residuals of the nominal motion
 
+_Box = tuple[np.ndarray, np.ndarray]
+_Log = Callable[[float], None]
 Motions = Callable[[Float[np.ndarray, "motions dim"], Float[np.ndarray, "motions windows start"]], np.ndarray]
 """Function from points and changes of the starts, in units of their noise, to residuals by motion, window and number."""
 
@@ -65,14 +67,7 @@ class Ensemble(NamedTuple):
         return model.over_root(self.noise) @ np.append(1.0, self.point - model.middle) * self.noise
 
 
-def fit(
-    motions: Motions,
-    box: tuple[np.ndarray, np.ndarray],
-    starts: tuple[int, int],
-    count: int,
-    noise: float | None,
-    log: Callable[[float], None],
-) -> Ensemble:
+def fit(motions: Motions, box: _Box, starts: tuple[int, int], count: int, noise: float | None, log: _Log) -> Ensemble:
     """Return the ensemble whose mean motion fits best.
 
     Args:
@@ -113,9 +108,7 @@ def fit(
 class _Draw:
     """Motions of points about a middle, or between the bounds, with starts off by their noise."""
 
-    def __init__(
-        self, motions: Motions, box: tuple[np.ndarray, np.ndarray], starts: tuple[int, int], count: int, noise: float
-    ):
+    def __init__(self, motions: Motions, box: _Box, starts: tuple[int, int], count: int, noise: float):
         self._motions, self._box, self._starts, self.noise = motions, box, starts, noise
         fewest = _PER_NUMBER * len(box[0])
         self.size, self.most = (max(fewest, min(number, int(_MOST_NUMBERS / count))) for number in _NUM_MOTIONS)
@@ -123,7 +116,7 @@ class _Draw:
 
     def __call__(
         self, middle: np.ndarray | None = None, covariance: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, ...]:
         """Return points, changes of the starts, and residuals of the motions that stay finite."""
         if middle is None or covariance is None:
             points = self._rng.uniform(*self._box, (self.size, len(self._box[0])))
@@ -148,9 +141,7 @@ class _Draw:
         return [(points[best].mean(axis=0), starts[best, np.arange(len(best))]) for best in order]
 
 
-def _narrowed(
-    draw: _Draw, count: int, noise: float | None, log: Callable[[float], None]
-) -> tuple[float, np.ndarray, np.ndarray]:
+def _narrowed(draw: _Draw, count: int, noise: float | None, log: _Log) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the nominal root mean square, and mean and covariance of points that fit best, by the cross-entropy method."""
     points, _, residuals = draw()
     first, medians = float(np.sqrt((residuals[0] ** 2).sum() / count)), [np.inf]

@@ -30,6 +30,7 @@ _WRITTEN = (
     *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "dof_damping", "dof_armature", "dof_frictionloss"),
     *("body_mass", "body_ipos", "body_inertia", "body_iquat"),
 )
+_Sizes = Mapping[str, float]  # of noise
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
 
@@ -71,9 +72,7 @@ def parameter(scene: Scene, text: str) -> Parameter:
     return parameters.inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
 
 
-def recording(
-    scene: Scene, path: str | Path, noise: Mapping[str, float] | None = None
-) -> tuple[Recording, tuple[str, ...]]:
+def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tuple[Recording, tuple[str, ...]]:
     """Return a motion recorded as CSV with a line of names, or as NPZ, and the names of columns that the scene does not have.
 
     Columns are as `mjxgrad identify --help` tells. An array of an NPZ has one row per time, with one number or all of the
@@ -214,9 +213,7 @@ def _size(model: mujoco.MjModel, name: str, value: np.ndarray) -> np.ndarray:
     return np.maximum(size, _SMALLEST_SIZE * size.max(initial=0.0)) if size.any() else np.ones_like(size)
 
 
-def _stated(
-    scene: Scene, found: Mapping[str, np.ndarray], noise: Mapping[str, float], path: str
-) -> dict[str, np.ndarray]:
+def _stated(scene: Scene, found: Mapping[str, np.ndarray], noise: _Sizes, path: str) -> dict[str, np.ndarray]:
     """Return the stated noise of each column; for positions, one number per velocity."""
     model, places = scene.mj_model, _places(scene.mj_model)
     scale = {name: np.full(value.shape[1], np.nan) for name, value in found.items()}

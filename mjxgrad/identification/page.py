@@ -21,11 +21,9 @@ def identified_page(
     name: str, scene: Scene, result: Identification, recordings: Sequence[Recording], held_out: Sequence[Recording]
 ) -> str:
     """Return a self-contained page on the search from a scene with the nominal values; needs `mjxgrad[render]`."""
-    condition = f"Condition number {result.condition_number:.2g}: combinations of parameters have narrower intervals."
+    told = f"Condition number {result.condition_number:.2g}: combinations of parameters have narrower intervals."
     head, *rows = result.rows()
-    numbers = Block(
-        faults=result.warnings(), items=[condition] * (result.condition_number > 100), table=Table(head, rows)
-    )
+    numbers = Block(faults=result.warnings(), items=[told] * (result.condition_number > 100), table=Table(head, rows))
     # The held-out end of a single recording, else the first recording.
     motions = [recordings[0], *(held_out[:1] if len(recordings) == 1 else ())]
     blocks = [_figures(scene, result, motions), numbers, Block(folded="In words", code=result.summary())]
@@ -55,10 +53,8 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
     panel = functools.partial(_panel, float(scene.model.opt.timestep), fitted_until)
     drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals if one[0] >= least]
     caption = "SI units. Dots: measured. Dashed: where the search began. Line: with the values found. Grey: held out."
-    if result.num_motions > 1:
-        caption += (
-            f" Contacts chatter: one motion, as this line, parts from the dots; the mean of {result.num_motions} fits."
-        )
+    if (count := result.num_motions) > 1:
+        caption += f" Contacts chatter: one motion, as this line, parts from the dots; the mean of {count} fits."
     if len(signals) > len(drawings):
         caption += f" The {len(drawings)} of {len(signals)} signals that changed most."
     return Block(drawings=drawings, caption=caption)

@@ -80,17 +80,14 @@ class Coordinates(eqx.Module):
         """Return the coordinates of named parameters, at least one."""
         if not parameters:
             raise ValueError("parameters must name at least one parameter, got none")
-        nominal, lower, upper = [
-            jnp.asarray(np.concatenate([getattr(p, part).ravel() for p in parameters.values()]))
-            for part in ("nominal", "lower", "upper")
-        ]
+        joined = lambda part: jnp.asarray(np.concatenate([getattr(p, part).ravel() for p in parameters.values()]))  # noqa: E731
         names = [
             name + "".join(f"[{i}]" for i in place if p.nominal.size > 1)
             for name, p in parameters.items()
             for place in np.ndindex(p.nominal.shape)
         ]
         shapes = tuple((name, p.nominal.shape) for name, p in parameters.items())
-        return cls(nominal, lower, upper, tuple(names), shapes)
+        return cls(joined("nominal"), joined("lower"), joined("upper"), tuple(names), shapes)
 
     def unravel(self, vector: Float[ArrayLike, " dim"]) -> dict[str, Any]:
         """Return the parameters by name."""

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mjxgrad._arrays import instance, real
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.bodies.tree import joint_runs
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene, sensor
 from mjxgrad.stepping import Contact
@@ -63,10 +64,8 @@ class Recording:
             raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {lengths}")
         count = len(self.controls) if self.controls is not None else None
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
-            needed = f"{count + 1} rows for {count} controls, one at each state"
-            raise ValueError(
-                f"measured of {self.name} must have {needed}, or times, got {max(lengths)}: NaN fills gaps"
-            )
+            needed = f"{count + 1} rows for {count} controls, one at each state, or times"
+            raise ValueError(f"measured of {self.name} must have {needed}, got {max(lengths)}: NaN fills gaps")
         instance(f"start of {self.name}", self.start, State | None, "of mg.initial_state")
         if unknown := set(self.noise) - set(rows):
             raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
@@ -96,12 +95,10 @@ class Recording:
         for begin in begins:
             rows = np.flatnonzero((times >= begin - timestep / 2) & (times <= begin + duration + timestep / 2))
             measured = {name: value[rows] for name, value in self.measured.items()}
-            start, name = times[rows[0]], f"{self.name} from {times[rows[0]]:g} s"
+            start, name, after = times[rows[0]], f"{self.name} from {times[rows[0]]:g} s", times[rows] - times[rows[0]]
             kept = np.zeros(0, bool) if at is None else at - start > -timestep / 2
             given = (None, None) if at is None else (np.asarray(controls)[kept], np.maximum(at[kept] - start, 0))
-            windows.append(
-                Recording(measured, given[0], times[rows] - start, given[1], self.noise, None, name, self.knows_noise)
-            )
+            windows.append(Recording(measured, given[0], after, given[1], self.noise, None, name, self.knows_noise))
         return windows
 
 
@@ -129,7 +126,7 @@ def stack(scene: Scene, recordings: Sequence[Recording]) -> Windows:
     steps = [_num_steps(one, timestep) for one in recordings]
     names = list(dict.fromkeys(name for one in recordings for name in one.measured))
     num_steps, num_rows = max(steps), max(len(_times(one, timestep)) for one in recordings)
-    parts = [_window(scene, one, names, num_steps, num_rows, timestep) for one in recordings]
+    parts = [_window(scene, one, names, num_steps, num_rows) for one in recordings]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
 
 
@@ -143,16 +140,13 @@ def _num_steps(recording: Recording, timestep: float) -> int:
     """Return the number of steps up to the last measurement; refuse more than there are controls."""
     needed = max(1, int(np.ceil(_times(recording, timestep)[-1] / timestep - 1e-6)))
     if recording.controls is not None and recording.control_times is None and needed > len(recording.controls):
-        given = len(recording.controls)
-        raise ValueError(
-            f"controls of {recording.name} must have a row for each of {needed} measured steps, got {given}"
-        )
+        name, given = recording.name, len(recording.controls)
+        raise ValueError(f"controls of {name} must have a row for each of {needed} measured steps, got {given}")
     return needed
 
 
-def _window(
-    scene: Scene, recording: Recording, names: list[str], num_steps: int, num_rows: int, timestep: float
-) -> Windows:
+def _window(scene: Scene, recording: Recording, names: list[str], num_steps: int, num_rows: int) -> Windows:
+    timestep = float(scene.model.opt.timestep)
     times = _times(recording, timestep)
     place = np.clip(times / timestep, 0, num_steps)
     index = np.minimum(np.floor(place + 1e-6).astype(int), num_steps - 1)
@@ -161,10 +155,8 @@ def _window(
     for name in names:
         width = _width(scene, name)
         value = recording.measured.get(name, np.full((len(times), width), np.nan))
-        if value.shape[1] != width:
-            raise ValueError(
-                f"{name} of {recording.name} must have {width} columns in this scene, got {value.shape[1]}"
-            )
+        if (given := value.shape[1]) != width:
+            raise ValueError(f"{name} of {recording.name} must have {width} columns in this scene, got {given}")
         columns = scene.model.nv if name == "qpos" else width
         noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
         is_there = np.isfinite(value)
@@ -175,14 +167,9 @@ def _window(
                 raise ValueError(f"qpos of {recording.name} must have all four numbers of a quaternion, or none")
         weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
         measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
-    return Windows(
-        state=start_of(scene, recording, times),
-        controls=jnp.asarray(_controls(scene, recording, num_steps, timestep)),
-        index=jnp.asarray(np.pad(index, spare)),
-        share=jnp.asarray(np.pad(place - index, spare)),
-        measured=measured,
-        weight=weight,
-    )
+    controls = jnp.asarray(_controls(scene, recording, num_steps, timestep))
+    index, share = (jnp.asarray(np.pad(x, spare)) for x in (index, place - index))
+    return Windows(start_of(scene, recording, times), controls, index, share, measured, weight)
 
 
 def spread(scene: Scene, recordings: Sequence[Recording], free_start: bool | None) -> Float[np.ndarray, "windows both"]:
@@ -214,11 +201,13 @@ def after_start(windows: Windows, spread: Float[np.ndarray, "windows both"]) -> 
 
 def coordinates(model: mjx.Model | mujoco.MjModel) -> list[slice]:
     """Return for each velocity the numbers of a position that it changes: one, or all four of a quaternion."""
-    found, (ball, free) = [], (int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE))
-    for dof, joint in enumerate(np.asarray(model.dof_jntid).tolist()):
-        kind, nth = model.jnt_type[joint], dof - model.jnt_dofadr[joint]
-        first, turns = int(model.jnt_qposadr[joint] + nth), kind == ball or (kind == free and nth > 2)
-        found.append(slice(first - nth % 3, first - nth % 3 + 4) if turns else slice(first, first + 1))
+    found = []
+    for run in joint_runs(model):
+        turns = run.width > 1  # by a quaternion, whose four numbers are a joint's last
+        for end in range(run.qpos.start + run.width, run.qpos.stop + 1, run.width):
+            found += [slice(i, i + 1) for i in range(end - run.width, end - 4 * turns)] + [
+                slice(end - 4, end)
+            ] * 3 * turns
     return found
 
 
@@ -238,17 +227,14 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
 
 
 def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:
+    name = recording.name
     if recording.controls is None and scene.model.nu:
-        raise ValueError(
-            f"controls of {recording.name} must be given in a scene with actuators, zeros for rest, got none"
-        )
+        raise ValueError(f"controls of {name} must be given in a scene with actuators, zeros for rest, got none")
     if recording.controls is None:
         return np.broadcast_to(np.asarray(scene.data.ctrl), (num_steps, scene.model.nu))
     controls = np.asarray(recording.controls, float)
     if controls.ndim != 2 or controls.shape[1] != scene.model.nu:
-        raise ValueError(
-            f"controls of {recording.name} must have {scene.model.nu} columns in this scene, got {controls.shape}"
-        )
+        raise ValueError(f"controls of {name} must have {scene.model.nu} columns in this scene, got {controls.shape}")
     if recording.control_times is not None:
         at = timestep * np.arange(num_steps)
         return np.column_stack([np.interp(at, recording.control_times, column) for column in controls.T])

@@ -175,19 +175,19 @@ class Identification(Printed):
             found.append(
                 "Stalled: the mean of many motions does not settle. Give narrower bounds, shorter windows or softer contact."
             )
-        if self.has_noise and self.rms[1] < _OVERSTATED and self.num_numbers >= _ENOUGH:
+        after, is_enough = self.rms[1], self.num_numbers >= _ENOUGH
+        if self.has_noise and after < _OVERSTATED and is_enough:
             found.append(
-                f"The stated noise is larger than what is left: {self.rms[1]:.2g} of it; some intervals are too wide."
+                f"The stated noise is larger than what is left: {after:.2g} of it; some intervals are too wide."
             )
-        left = max(self.rms[1], 1.0 if self.has_noise else _REMOVED * self.rms[0])
+        left = max(after, 1.0 if self.has_noise else _REMOVED * self.rms[0])
         if self.held_out_rms is not None and self.held_out_rms[1] > _DEPARTS * left:
             found.append(
                 f"What was held out departs ({self.held_out_rms[1]:.3g}): it is foretold from its first row, whose noise grows, "
                 "most where contacts chatter."
             )
-        if self.correlation > _RELATED and self.rms[1] > _REMOVED * self.rms[0] and self.num_numbers >= _ENOUGH:
-            is_fixed = self.offsets is None
-            starts = "The starts may be noisy: free_start=True (--start free) finds them. " * is_fixed
+        if self.correlation > _RELATED and after > _REMOVED * self.rms[0] and is_enough:
+            starts = "The starts may be noisy: free_start=True (--start free) finds them. " * (self.offsets is None)
             found.append(
                 f"Residuals follow one another (correlation {self.correlation:.2f} from one time to the next), so something is "
                 f"not as in the scene. {starts}Values may be off by more than their intervals, which assume independent noise."
@@ -197,10 +197,8 @@ class Identification(Printed):
         for combination in self.inseparable:
             changes = " with ".join(f"{100 * share:+.2g} % of {name}" for name, share in combination.items())
             found.append(f"Cannot be told apart: {', '.join(combination)}. {changes} changes nothing measured.")
-        if self.at_bounds:
-            found.append(
-                f"At a bound: {', '.join(self.at_bounds)}. The data ask for more; widen it or doubt the model."
-            )
+        if names := ", ".join(self.at_bounds):
+            found.append(f"At a bound: {names}. The data ask for more; widen it or doubt the model.")
         return found
 
     def save(self, path: str | Path) -> None:

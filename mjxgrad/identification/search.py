@@ -31,7 +31,7 @@ from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
-Log = Callable[[int, dict[str, float]], None]
+Log = Callable[[int, dict[str, float]], None] | None
 _TOO_LITTLE = 1e-3  # gain of a step at the end, of the noise variance
 _LEFT, _DOUBT = 0.3, 0.05  # of the first residuals; chance of noise alone, below which better values are sought
 _NUM_AWAY, _CLEAR = 5, 1e-10  # points a standard error away; share of the largest curvature that counts
@@ -39,6 +39,17 @@ _RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretel
 _BETTER = 1.1  # residuals of one motion over the ensemble's at most
 _SHORT, _AGREE = 10, 4  # steps of a descent from a motion that nearly fits; ends alike at which no better one is sought
 _MOST_AT_ONCE, _SIDE_BY_SIDE = 256, 64  # motions in one call, and in one batch, for memory
+
+
+class _End(NamedTuple):
+    """The end of a descent: the best point, and how the search came there."""
+
+    point: Array
+    found: tuple[Array, ...]  # residuals and their derivatives there
+    num_steps: int
+    stopped: Stopped
+    first: float  # root mean square of the residuals at the start
+    away: Float[np.ndarray, "dim dim"] | float = 0.0  # second moment of the distances to other ends
 
 
 def identify(
@@ -51,7 +62,7 @@ def identify(
     free_start: bool | None = None,
     contact: Contact | None = None,
     max_steps: int = 100,
-    log: Log | None = None,
+    log: Log = None,
 ) -> Identification:
     r"""Identify parameters of a scene from recorded motions, through contact.
 
@@ -82,9 +93,8 @@ def identify(
         DivergedError: if the simulation diverges with the nominal values.
     """
     if isinstance(recordings, Recording) or not recordings:
-        raise ValueError(
-            f"recordings must hold at least one, in a list, got {(recordings and 'a recording') or 'none'}"
-        )
+        given = "a recording" if isinstance(recordings, Recording) else "none"
+        raise ValueError(f"recordings must hold at least one, in a list, got {given}")
     instance("parameters", parameters, Mapping, "a dict from names to parameters")
     for part in parameters.values():
         instance("parameters", part, Parameter, "of mg.identification, such as mass(scene, 'torso')")
@@ -128,7 +138,7 @@ def identify(
     return _identified(program, end, many, held_out, has_noise)
 
 
-def _ensemble(program: "_Program", noise: float | None, steps: Iterator[int], log: Log | None) -> Ensemble:
+def _ensemble(program: "_Program", noise: float | None, steps: Iterator[int], log: Log) -> Ensemble:
     def say(rms: float) -> None:
         step = next(steps)
         if log is not None:
@@ -140,9 +150,7 @@ def _ensemble(program: "_Program", noise: float | None, steps: Iterator[int], lo
     return fit(run, (box[0], box[1]), program.spread.shape, _num_numbers(windows), noise, say)
 
 
-def _alone(
-    program: "_Program", end: "_End", many: Ensemble, steps: Iterator[int], max_steps: int, log: Log | None
-) -> "_End":
+def _alone(program: "_Program", end: _End, many: Ensemble, steps: Iterator[int], max_steps: int, log: Log) -> _End:
     """Return the best end of descents from the motions that fit best.
 
     The sum of squares has many minima, by noisy starts or by chatter. Others' distances, weighed by likelihood, are what the
@@ -171,23 +179,12 @@ def _told(residual: np.ndarray, slope: np.ndarray, least: float) -> float:
     return float(np.linalg.slogdet(slope.T @ slope / max(np.mean(residual**2), least))[1])
 
 
-def _is_off(program: "_Program", end: "_End", noise: float | None, chance: float = CHANCE) -> bool:
+def _is_off(program: "_Program", end: _End, noise: float | None, chance: float = CHANCE) -> bool:
     """Return whether a descent left more than noise has by chance; if that is not known, whether it explained little."""
     after = _rms(program, end.found)
     if noise:
         return exceeds_noise(after / noise, program.num_numbers - len(program.start()), chance)
     return after > _LEFT * end.first
-
-
-class _End(NamedTuple):
-    """The end of a descent: the best point, and how the search came there."""
-
-    point: Array
-    found: tuple[Array, ...]  # residuals and their derivatives there
-    num_steps: int
-    stopped: Stopped
-    first: float  # root mean square of the residuals at the start
-    away: Float[np.ndarray, "dim dim"] | float = 0.0  # second moment of the distances to other ends
 
 
 def _identified(
@@ -375,7 +372,7 @@ def _num_numbers(windows: Windows) -> int:
     return sum(int((np.asarray(weight) > 0).sum()) for weight in windows.weight.values())
 
 
-def _descend(program: _Program, point: Array, steps: Iterator[int], max_steps: int, log: Log | None) -> _End:
+def _descend(program: _Program, point: Array, steps: Iterator[int], max_steps: int, log: Log) -> _End:
     """Minimise the residuals from a point, until an interruption at most."""
     tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
     end = best = _End(point, program(point), 0, Stopped.INTERRUPTED, 0.0)
