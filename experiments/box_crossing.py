@@ -116,7 +116,8 @@ def loss(outcome: Outcome):
     figure, axes = subplots(1, 2, height=5.2, width_ratios=[3, 2])
     (left, right), times = axes[0], np.geomspace(0.1, outcome.settings.seconds, 400)
     kinds = [label.split(",")[0] for label in outcome.runs]
-    colours = {kind: look["color"] for kind, look in zip(unique := dict.fromkeys(kinds), looks(unique), strict=True)}
+    unique = dict.fromkeys(kinds)
+    colours = {kind: look["color"] for kind, look in zip(unique, looks(unique), strict=True)}
     for one, kind in zip(outcome.settings.methods, kinds, strict=False):
         style, runs = ":" if one.engine == "mjx" else "-" if one.wheels == "capsule" else "--", outcome.runs[one.label]
         worst = [max(np.fmin.reduce(run.loss[run.seconds <= time], initial=9) for run in runs) for time in times]
