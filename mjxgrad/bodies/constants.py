@@ -19,7 +19,7 @@ CAUSES = {
     *("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat", "dof_armature"),
     *("jnt_pos", "jnt_axis", "qpos0", "site_pos", "tendon_armature", "actuator_gear"),
 }
-_Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
+_Geom = mujoco.mjtGeom
 # `body_simple` of a childless body on slides along the world's axes: only its mass counts.
 _SLIDING = 2
 
@@ -73,12 +73,9 @@ def _of_bodies(model: mjx.Model, data: mjx.Data, inverse: Float[Array, "nv nv"])
 
 def _of_dofs(model: mjx.Model, inverse: Float[Array, "nv nv"]) -> Float[Array, " nv"]:
     """Return the diagonal of the inverse, averaged over a ball joint and over each half of a free joint."""
-    mean = np.zeros((model.nv, model.nv))
-    for kind, first in zip(model.jnt_type, model.jnt_dofadr, strict=True):
-        widths = {_Joint.mjJNT_FREE: (3, 3), _Joint.mjJNT_BALL: (3,)}.get(_Joint(kind), (1,))
-        for start, width in zip(np.cumsum((first, *widths)), widths, strict=False):
-            mean[start : start + width, start : start + width] = 1 / width
-    return jnp.asarray(mean, inverse.dtype) @ jnp.diag(inverse)
+    first = tree.first_dofs(model)
+    is_same = first[:, None] == first
+    return jnp.asarray(is_same / is_same.sum(axis=1), inverse.dtype) @ jnp.diag(inverse)
 
 
 def bounding_radii(model: mjx.Model) -> Float[Array, " ngeom"]:

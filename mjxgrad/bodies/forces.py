@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from mjxgrad._mjx import compensate_gravity, fluid_force, mjx
 from mjxgrad.batched import cholesky, maps
 from mjxgrad.batched.maps import contract, pick
-from mjxgrad.bodies import kinematics, mended, spatial, tree
+from mjxgrad.bodies import kinematics, mended, spatial
 
 _Disable = mujoco.mjtDisableBit
 _Joint = mujoco.mjtJoint
@@ -61,7 +61,8 @@ def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     # MJX drops all passive forces where either is disabled.
     if flags & (_Disable.mjDSBL_SPRING | _Disable.mjDSBL_DAMPER):
         return data.replace(qfrc_passive=none, qfrc_gravcomp=none)
-    force = _springs(model, data.qpos) - model.dof_damping * data.qvel
+    stretch = kinematics.position_change(model, model.qpos_spring, data.qpos)
+    force = -pick(model.dof_jntid, model.jnt_stiffness) * stretch - model.dof_damping * data.qvel
     if model.ntendon:
         force += contract("tv,t->v", data._impl.ten_J, _tendon_forces(model, data))
     compensation = none
@@ -80,23 +81,6 @@ def _tendon_forces(model: mjx.Model, data: mjx.Data) -> Float[Array, " tendons"]
     stretch = jnp.where(data.ten_length <= shortest, data.ten_length - shortest, 0.0)
     stretch = jnp.where(data.ten_length >= longest, data.ten_length - longest, stretch)
     return -model.tendon_stiffness * stretch - model.tendon_damping * data._impl.ten_velocity
-
-
-def _springs(model: mjx.Model, qpos: Float[Array, " nq"]) -> Float[Array, " nv"]:
-    forces = []
-    for run in tree.joint_runs(model):
-        q, rest = qpos[run.qpos], model.qpos_spring[run.qpos]
-        stiffness = model.jnt_stiffness[run.joints]
-        if run.kind in _ON_AXES:
-            forces.append(stiffness * (rest - q))
-            continue
-        q, rest = q.reshape(-1, run.width), rest.reshape(-1, run.width)
-        inverse = spatial.conjugate(rest[:, -4:])
-        stretch = spatial.logarithm(spatial.multiply(inverse, q[:, -4:]))
-        if run.kind == _Joint.mjJNT_FREE:
-            stretch = jnp.concatenate([q[:, :3] - rest[:, :3], stretch], axis=1)
-        forces.append(-(stiffness[:, None] * stretch).reshape(-1))
-    return jnp.concatenate(forces)
 
 
 def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from mjxgrad._mjx import mjx
 from mjxgrad.batched import maps
@@ -29,7 +29,6 @@ from mjxgrad.bodies.orientation import orientation
 _Position = Float[Array, " nq"]
 _Vector = Float[Array, " nv"]
 _Duration = Float[Array, ""] | float
-_Index = Int[np.ndarray, " _"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _UP = np.array([0.0, 0.0, 1.0])
@@ -250,13 +249,16 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
 
 def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duration: _Duration) -> _Position:
     """Return the position after a duration (s) at constant joint velocity; quaternions turn in their own frame."""
-    dof, entry, quaternions, turns = _places(model)
-    if not quaternions.size:
-        return qpos + duration * qvel
-    moved = qpos + duration * pick(dof, qvel)
-    turn = spatial.exponential(duration * pick(turns, qvel).reshape(-1, 3))
-    turned = spatial.normalise(spatial.multiply(pick(quaternions, qpos).reshape(-1, 4), turn))
-    return jnp.where(entry < 0, moved, pick(entry, turned.reshape(-1)))
+    parts = []
+    for run in tree.joint_runs(model):
+        q, change = qpos[run.qpos].reshape(-1, run.width), duration * qvel[run.dofs]
+        if run.width > 1:
+            change = change.reshape(len(q), -1)
+            turned = spatial.normalise(spatial.multiply(q[:, -4:], spatial.exponential(change[:, -3:])))
+            parts.append(jnp.concatenate([q[:, :-4] + change[:, :-3], turned], axis=1).reshape(-1))
+        else:
+            parts.append(q[:, 0] + change)
+    return jnp.concatenate(parts)
 
 
 def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
@@ -264,37 +266,12 @@ def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vect
 
     The inverse of `integrate_position`.
     """
-    dof, _, quaternions, turns = _places(model)
-    if not quaternions.size:
-        return end - start
-    before, after = (pick(quaternions, x).reshape(-1, 4) for x in (start, end))
-    turned = spatial.logarithm(spatial.multiply(spatial.conjugate(before), after)).reshape(-1)
-    return pick(_inverse(dof, model.nv), end - start) + pick(_inverse(turns, model.nv), turned)
-
-
-def _places(model: mjx.Model) -> tuple[_Index, _Index, _Index, _Index]:
-    """Return index arrays between coordinates, joint velocities and entries of quaternions; -1 for none.
-
-    They are the joint velocity that adds to each coordinate, the place of each coordinate among the entries of quaternions, the
-    coordinates of these entries, and the joint velocities of ball joints and of the rotations of free joints.
-    """
-    dof, quaternions, turns = np.full(model.nq, -1), [], []
-    for kind, address, first in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
-        is_free = kind == _Joint.mjJNT_FREE
-        if is_free:
-            dof[address : address + 3] = np.arange(first, first + 3)
-            address, first = address + 3, first + 3
-        if is_free or kind == _Joint.mjJNT_BALL:
-            quaternions += range(address, address + 4)
-            turns += range(first, first + 3)
-        else:
-            dof[address] = first
-    quaternions, turns = np.array(quaternions, int), np.array(turns, int)
-    return dof, _inverse(quaternions, model.nq), quaternions, turns
-
-
-def _inverse(index: _Index, size: int) -> _Index:
-    """Return the position of each place in an index, -1 where it is missing."""
-    inverse = np.full(size, -1)
-    inverse[index[index >= 0]] = np.flatnonzero(index >= 0)
-    return inverse
+    parts = []
+    for run in tree.joint_runs(model):
+        before, after = (x[run.qpos].reshape(-1, run.width) for x in (start, end))
+        change = after - before
+        if run.width > 1:
+            turn = spatial.multiply(spatial.conjugate(before[:, -4:]), after[:, -4:])
+            change = jnp.concatenate([change[:, :-4], spatial.logarithm(turn)], axis=1)
+        parts.append(change.reshape(-1))
+    return jnp.concatenate(parts)

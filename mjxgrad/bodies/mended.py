@@ -58,7 +58,7 @@ def copy_of(name: str, **replaced: Callable | ModuleType) -> ModuleType:
     return module
 
 
-def _muscle_dynamics_timescale(dctrl: _Scalar, tau_act: _Scalar, tau_deact: _Scalar, width: _Scalar) -> _Scalar:
+def _timescale(dctrl: _Scalar, tau_act: _Scalar, tau_deact: _Scalar, width: _Scalar) -> _Scalar:
     """Return the time constant of a muscle (s), which switches at once or over a width of the control."""
     is_hard = width < mujoco.mjMINVAL
     x = jnp.clip(dctrl / jnp.where(is_hard, 1.0, width) + 0.5, 0, 1)
@@ -180,9 +180,7 @@ def _bends(a: _Point, b: _Point, radius: _Scalar) -> Bool[Array, ""]:
 
 # These modules use only the product of axis and angle.
 _math = copy_of("math", quat_to_axis_angle=lambda q: (spatial.logarithm(q), 1.0), safe_div=_safe_div)
-_support = copy_of(
-    "support", muscle_dynamics_timescale=_muscle_dynamics_timescale, _length_circle=_arc_length, math=_math
-)
+_support = copy_of("support", muscle_dynamics_timescale=_timescale, _length_circle=_arc_length, math=_math)
 _support.wrap = partial(_wrap, _support.wrap_circle)
 _smooth = copy_of("smooth", math=_math, support=_support)
 _forward = copy_of("forward", support=_support)

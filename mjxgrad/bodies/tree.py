@@ -22,6 +22,7 @@ class Run:
     kind: mujoco.mjtJoint
     joints: slice
     qpos: slice
+    dofs: slice
     width: int  # positions per joint
 
 
@@ -43,16 +44,17 @@ class Frames:
     after_joint: np.ndarray  # the turn of a joint that moves its body about its anchor
 
 
-def joint_runs(model: mjx.Model) -> tuple[Run, ...]:
+def joint_runs(model: mjx.Model | mujoco.MjModel) -> tuple[Run, ...]:
     """Return the joints in order, as runs of one type."""
     runs, start = [], 0
     for end in range(1, model.njnt + 1):
         if end < model.njnt and model.jnt_type[end] == model.jnt_type[start]:
             continue
         kind = mujoco.mjtJoint(int(model.jnt_type[start]))
-        width = {_FREE: 7, _BALL: 4}.get(kind, 1)
-        first = int(model.jnt_qposadr[start])
-        runs.append(Run(kind, slice(start, end), slice(first, first + width * (end - start)), width))
+        width, num_dofs = {_FREE: (7, 6), _BALL: (4, 3)}.get(kind, (1, 1))
+        first, dof, count = int(model.jnt_qposadr[start]), int(model.jnt_dofadr[start]), end - start
+        qpos, dofs = slice(first, first + width * count), slice(dof, dof + num_dofs * count)
+        runs.append(Run(kind, slice(start, end), qpos, dofs, width))
         start = end
     return tuple(runs)
 
@@ -132,15 +134,15 @@ def earlier_dofs(model: mjx.Model) -> np.ndarray:
     All joints before an axis move it. The three axes of a ball joint turn with its parent (MuJoCo's convention, not the
     total derivative). The rotation of a free joint comes after its translation.
     """
-    moves, earlier = moving_dofs(model), np.zeros((model.nv, model.nv))
-    for dof in range(model.nv):
-        body, joint = model.dof_bodyid[dof], model.dof_jntid[dof]
-        first = model.jnt_dofadr[joint]
-        if model.jnt_type[joint] == _FREE and dof >= first + 3:
-            first += 3
-        earlier[dof] = moves[model.body_parentid[body]]
-        earlier[dof, model.body_dofadr[body] : first] = 1
-    return earlier
+    body, dofs = model.dof_bodyid, np.arange(model.nv)
+    is_own = (dofs >= model.body_dofadr[body][:, None]) & (dofs < first_dofs(model)[:, None])
+    return np.where(is_own, 1.0, moving_dofs(model)[model.body_parentid[body]])
+
+
+def first_dofs(model: mjx.Model) -> np.ndarray:
+    """Return for each joint velocity the first one of its joint, or of the rotation of a free joint."""
+    first = model.jnt_dofadr[model.dof_jntid]
+    return first + 3 * (np.arange(model.nv) - first >= 3)
 
 
 def descendants(model: mjx.Model | mujoco.MjModel) -> np.ndarray:
