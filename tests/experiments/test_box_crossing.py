@@ -25,7 +25,8 @@ def test_the_loss_is_that_of_a_loop_over_mujocos_steps():
         mujoco.mj_step(model, data)
         path = [np.interp(0.005 * (i + 1), 0.5 * np.arange(13), along) for along in problem.PATH]
         total += np.sum((data.qpos[:2] - path) ** 2) / 1200
-    assert float(task.loss(task.start(7))) == pytest.approx(total, rel=1e-9)
+    # Rounding grows where a wheel leaves an edge; a path late by one step would change the loss by 2e-3.
+    assert float(task.loss(task.start(7))) == pytest.approx(total, rel=1e-4)
 
 
 @pytest.mark.parametrize(("seed", "published"), [(42, 1.4771), (43, 1.1970), (44, 1.7449)])
