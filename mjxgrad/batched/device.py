@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,22 +87,19 @@ def over_devices(function: Callable[..., Any], *, num_shared: int = 0) -> Callab
         ((size,),) = sizes
         if size % len(own):
             raise ValueError(f"the batch must be a multiple of the {len(own)} devices, got {size}")
-        mesh = jax.sharding.Mesh(np.array(own), ("batch",))
-        leaves, structure = jax.tree.flatten(args)
-        num_whole = len(jax.tree.leaves(args[:num_shared]))
-        specs = [jax.sharding.PartitionSpec(*() if i < num_whole else ("batch",)) for i in range(len(leaves))]
-        # XLA's partitioner crashes on empty inputs that are used (jax 0.11.2), so each device makes its own. Under `jax.jit`
-        # the arrays that the function closes over are no inputs.
-        part_of = lambda i, x: x.shape if i < num_whole else (size // len(own), *x.shape[1:])  # noqa: E731
-        empty = {i: part_of(i, x) for i, x in enumerate(leaves) if not np.size(x)}
+        mesh, part = jax.sharding.Mesh(np.array(own), ("batch",)), jax.sharding.PartitionSpec("batch")
+        specs = tuple(jax.sharding.PartitionSpec() if i < num_shared else part for i in range(len(args)))
+        # XLA's partitioner crashes on empty inputs that are used (jax 0.11.2), so each device makes its own.
+        given, empty = eqx.partition(args, lambda x: np.size(x) > 0)
 
-        def of_part(given: list[Any]) -> Any:
-            numbers = iter(given)
-            parts = [jnp.zeros(empty[i], x.dtype) if i in empty else next(numbers) for i, x in enumerate(leaves)]
-            return jax.jit(batched)(*jax.tree.unflatten(structure, parts))
+        def of_part(*given: Any) -> Any:
+            made = []
+            for i, one in enumerate(empty):
+                count = 1 if i < num_shared else len(own)
+                zeros = lambda x, count=count: jnp.zeros((len(x) // count, *x.shape[1:]), x.dtype)  # noqa: E731
+                made.append(jax.tree.map(zeros, one))
+            return jax.jit(batched)(*eqx.combine(given, tuple(made)))
 
-        given, specs = ([x for i, x in enumerate(xs) if i not in empty] for xs in (leaves, specs))
-        part = jax.sharding.PartitionSpec("batch")
-        return jax.shard_map(of_part, mesh=mesh, in_specs=(specs,), out_specs=part, check_vma=False)(given)
+        return jax.shard_map(of_part, mesh=mesh, in_specs=specs, out_specs=part, check_vma=False)(*given)
 
     return wrapped

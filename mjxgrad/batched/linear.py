@@ -9,7 +9,7 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,6 @@ _Items = Float[Array, "n *rest"]
 _Matrix = Float[Array, "n n *batch"]
 # Longer sums are matrix products: written out they would take longer to compile than they save.
 LONGEST_SUM = 64
-# A batch is divided into so many parts where only some members need a result.
-_NUM_PARTS = 8
 _SWEEPS = 5  # of Jacobi's rotations; of a matrix of four rows the fifth changes nothing in double precision
 
 
@@ -67,58 +65,44 @@ def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "conta
     return add(terms[:, i : i + 1] for i in range(terms.shape[1]))
 
 
-def batch_last(function: Callable, batch: int | None = None) -> Callable:
+def batch_last(function: Callable) -> Callable:
     """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
 
-    Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank.
-
-    Args:
-        function: takes and returns pytrees of arrays. The arguments must not contain None: the forward mode of `custom_vmap`,
-            which `jax.hessian` uses, takes it for an array (jax 0.10.2).
-        batch: the size of a trailing axis that the arrays have already; None without one.
+    Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank. The function takes and returns
+    pytrees of arrays.
     """
+
+    def call(*args: PyTree) -> PyTree:
+        # The forward mode of `custom_vmap`, which `jax.hessian` uses, would take None for an array (jax 0.10.2).
+        leaves, structure = jax.tree.flatten(args)
+        return _of_leaves(lambda *given: function(*jax.tree.unflatten(structure, given)), None)(*leaves)
+
+    return call
+
+
+def _of_leaves(function: Callable, batch: int | None) -> Callable:
+    """Return the same for a function of arrays that may have a trailing axis of a batch already."""
     # Under `jax.jit` constants stay inside. `custom_vmap` refuses to batch constants, which `jax.lax.cond` requires
     # where its condition differs between members of the batch.
     batched = jax.custom_batching.custom_vmap(jax.jit(function))
 
     @batched.def_vmap
-    def rule(size, is_batched, *args):
-        has_batch = jax.tree.leaves(is_batched)
-        if not any(has_batch):  # in forward mode, where only the tangents are batched
-            result = function(*args)
+    def rule(size, is_batched, *leaves):
+        if not any(is_batched):  # in forward mode, where only the tangents are batched
+            result = function(*leaves)
             return result, jax.tree.map(lambda _: False, result)
 
         def back(x: Array) -> Array:
             split = x if batch is None else x.reshape(*x.shape[:-1], batch, size)
             return jnp.moveaxis(split, -1, 0)
 
-        leaves, structure = jax.tree.flatten(args)
-        moved = _moved_last(leaves, has_batch, size)
+        moved = _moved_last(leaves, is_batched, size)
         if batch is not None:
             moved = [x.reshape(*x.shape[:-2], batch * size) for x in moved]
-        merged = batch_last(function, size if batch is None else batch * size)
-        result = merged(*jax.tree.unflatten(structure, moved))
+        result = _of_leaves(function, size if batch is None else batch * size)(*moved)
         return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
     return batched
-
-
-def solve_subset(function: Callable, is_needed: Bool[Array, "*batch"], default: PyTree, *args: PyTree) -> PyTree:
-    """Return the function's result for the members of a batch that need it, and the default for the others.
-
-    The batch is the trailing axis of all arrays. An eighth of it is computed at a time until no member is left, which pays
-    where few members need the result.
-    """
-    if not is_needed.ndim:
-        return jax.lax.cond(is_needed, lambda: function(*args), lambda: default)
-    count = -(-is_needed.shape[0] // _NUM_PARTS)
-
-    def turn(state):
-        is_left, result = state
-        subset = Subset(is_left, count)
-        return is_left & ~subset.is_taken, subset.put(result, function(*subset.take(args)))
-
-    return jax.lax.while_loop(lambda state: jnp.any(state[0]), turn, (is_needed, default))[1]
 
 
 class Subset:
@@ -146,7 +130,7 @@ class Subset:
         return jax.tree.map(put, whole, part)
 
 
-def _moved_last(leaves: list[Array], is_batched: list[bool], size: int) -> list[Array]:
+def _moved_last(leaves: Sequence[Array], is_batched: Sequence[bool], size: int) -> list[Array]:
     """Return arrays with the batch as trailing axis; batched arrays of one type are moved in one operation."""
     moved = [
         None if has_batch else jnp.broadcast_to(x[..., None], (*x.shape, size))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,18 +25,16 @@ def sparsely(function: Callable, is_wanted: Bool[Array, " n"], each: PyTree, com
         each: the things, with an axis of n in front of all arrays.
         common: a tree that all share; it may be batched.
     """
-    leaves, form = jax.tree.flatten((each, common))
-    num_each = len(jax.tree.leaves(each))
-    is_given = [i < num_each or isinstance(x, jax.core.Tracer) for i, x in enumerate(leaves)]
-    given = [x for x, chosen in zip(leaves, is_given, strict=True) if chosen]
+    traced, known = eqx.partition(common, lambda x: isinstance(x, jax.core.Tracer))
+    leaves, form = jax.tree.flatten((each, traced))
 
     def at(*values: Array) -> PyTree:
-        rest = iter(values)
-        every = [next(rest) if chosen else x for x, chosen in zip(leaves, is_given, strict=True)]
-        return function(*jax.tree.unflatten(form, every))
+        each, traced = jax.tree.unflatten(form, values)
+        return function(each, eqx.combine(traced, known))
 
-    kinds = ["each"] * num_each + ["common"] * (len(given) - num_each)
-    return _gathered(jax.jit(at), kinds)(is_wanted, *given)
+    num_each = len(jax.tree.leaves(each))
+    kinds = ["each"] * num_each + ["common"] * (len(leaves) - num_each)
+    return _gathered(jax.jit(at), kinds)(is_wanted, *leaves)
 
 
 def _gathered(function: Callable, kinds: list[str]) -> Callable:
@@ -46,10 +45,8 @@ def _gathered(function: Callable, kinds: list[str]) -> Callable:
         count = len(is_wanted)
         groups = next((len(x) for x, kind in zip(leaves, kinds, strict=True) if kind == "group"), 1)
         size = min(count, max(_LEAST, math.ceil(count / _PARTS)))
-        every = jnp.arange(count, dtype=jnp.int32)
-        order = jnp.full(size * math.ceil(count / size), count, jnp.int32)
-        place = jnp.where(is_wanted, jnp.cumsum(is_wanted, dtype=jnp.int32) - 1, len(order))
-        order = order.at[place].set(every, mode="drop")
+        room = size * math.ceil(count / size)
+        order = jnp.flatnonzero(jnp.asarray(is_wanted), size=room, fill_value=count).astype(jnp.int32)
         own = jax.vmap(function, [None if kind == "common" else 0 for kind in kinds])
 
         def part(first: Array) -> tuple[Array, PyTree]:

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjxgrad.batched import device, linear
 from mjxgrad.batched.cholesky import SOLUTION
+from mjxgrad.batched.sparse import sparsely
 from mjxgrad.solver import constraint, hessian, newton
 from mjxgrad.solver.constraint import RowHessian, RowLayout
 from mjxgrad.solver.newton import System, Variant
@@ -69,19 +70,14 @@ def solve_both(
     Elsewhere the second solution is the first, and its derivative, which is zero, must not be used. The larger number of
     iterations is returned.
     """
-    minimise = functools.partial(newton.minimise, layout, max_iterations)
-    of_batch = linear.batch_last(minimise)
-
-    def second(system, differ, start, tolerance):
-        none = jnp.zeros(differ.shape, jnp.int32)
-        return linear.solve_subset(minimise, differ, (start, none), system, start, tolerance)
-
+    of_batch = linear.batch_last(functools.partial(newton.minimise, layout, max_iterations))
     if not device.is_cpu():  # a GPU solves all of them sooner than those that need it
         both, counts = jax.vmap(lambda v: of_batch(system.with_variant(v), start, tolerance))(variants)
         return both, jnp.max(counts)
     found, count = of_batch(system.with_variant(variants[0]), start, tolerance)
-    other, more = linear.batch_last(second)(system.with_variant(variants[1]), differ, found, tolerance)
-    return jnp.stack([found, other]), jnp.maximum(count, more)
+    given = system.with_variant(variants[1]), found, tolerance
+    (other,), (more,) = sparsely(lambda _, given: of_batch(*given), differ[None], differ[None], given)
+    return jnp.stack([found, jnp.where(differ, other, found)]), jnp.maximum(count, more)
 
 
 @solve_both.defjvp
@@ -120,14 +116,12 @@ def solve_linearised(
 
     def run(system, row_hessian, force):
         problem = system.problem(layout)
-        return hessian.solve_regularised(problem.mass, problem.jacobian, layout, row_hessian, force)
-
-    def run_where(system, row_hessian, force, is_needed):
-        return linear.solve_subset(run, is_needed, jnp.zeros_like(force), system, row_hessian, force)
+        return hessian.solve(problem.mass, problem.jacobian, layout, row_hessian, force, hessian.MAX_SHIFT)[0]
 
     def invert(_, force):
+        given = system, row_hessian, force
         if is_needed is None:
-            return linear.batch_last(run)(system, row_hessian, force)
-        return linear.batch_last(run_where)(system, row_hessian, force, is_needed)
+            return linear.batch_last(run)(*given)
+        return sparsely(lambda _, given: linear.batch_last(run)(*given), is_needed[None], is_needed[None], given)[0]
 
     return jax.lax.custom_linear_solve(apply, force, invert, symmetric=True)

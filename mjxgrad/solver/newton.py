@@ -18,7 +18,7 @@ an update along the line would keep rounding errors from a poor start.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -75,33 +75,14 @@ class Variant(eqx.Module):
         return jax.tree.map(lambda x: x[number], self)
 
 
-@jax.tree_util.register_pytree_node_class
-@dataclasses.dataclass(frozen=True)
-class System:
-    """The equations of motion of one state, in a form that can be differentiated.
-
-    As a pytree it is a list of arrays, without the None of parts that are absent; see `linear.batch_last`.
-    """
+class System(eqx.Module):
+    """The equations of motion of one state, in a form that can be differentiated."""
 
     inertia: Inertia  # M
     force: _Vector  # f_smooth, all forces except those of constraints (N or N m)
     map: JoinedRows  # J, inactive rows included
     is_active: Bool[Array, "rows *batch"]
     rows: Rows
-
-    def tree_flatten(self) -> tuple[Sequence[Any], Any]:
-        """Return the arrays and the structure that holds them."""
-        # JAX may have put None in place of arrays: only the structure that was kept tells them from absent parts.
-        fields = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return vars(self).get("_flat") or jax.tree.flatten(tuple(fields))
-
-    @classmethod
-    def tree_unflatten(cls, structure: Any, leaves: Any) -> "System":
-        """Return a system from its arrays; not by the constructor, whose check of shapes fails under `jax.vmap`."""
-        self = object.__new__(cls)
-        names = (field.name for field in dataclasses.fields(cls))
-        vars(self).update(zip(names, jax.tree.unflatten(structure, leaves), strict=True), _flat=(leaves, structure))
-        return self
 
     def mv(self, velocity: Float[Array, " nv"]) -> Float[Array, " rows"]:
         """Return J v, zero for inactive rows."""
@@ -345,13 +326,9 @@ def in_one_kernel(
     mass = on_gpu.filled(problem.mass)
     diagonal = jnp.maximum(linear.diagonal(mass), mujoco.mjMINVAL)
     width, height = on_gpu.padded(size), on_gpu.padded(len(dense_rows))
-    found, count = on_gpu.run(
-        kernel,
-        (mass, dense_rows, problem.force, diagonal, start, smallest, *by_row),
-        ((start.dtype, width), (jnp.int32, 1)),
-        width * height,
-        interpret=interpret,
-    )
+    inputs = mass, dense_rows, problem.force, diagonal, start, smallest, *by_row
+    outputs = (start.dtype, width), (jnp.int32, 1)
+    found, count = on_gpu.run(kernel, inputs, outputs, width * height, interpret=interpret)
     return found[:size], count[0]
 
 

@@ -57,14 +57,11 @@ def test_one_kernel_mends_what_the_operations_mend():
     mass, jacobian, row_hessian, vector = jax.tree.map(lambda x: x.astype(jnp.float32), problem)
     mass = mass.at[:2, :2, 0].set(jnp.array([[1, 1.0001], [1.0001, 1]], jnp.float32))
     row_hessian = jax.tree.map(lambda x: x.at[:, 0].set(0.0), row_hessian)
-    kernel = functools.partial(
-        hessian.in_one_kernel, max_shift=hessian._MAX_SHIFT, interpret=jax.default_backend() != "gpu"
-    )
+    most, interpret = hessian.MAX_SHIFT, jax.default_backend() != "gpu"
+    kernel = functools.partial(hessian.in_one_kernel, max_shift=most, interpret=interpret)
     found, _ = jax.jit(functools.partial(kernel, layout))(mass, jacobian, row_hessian, vector)
-    expected, (unmended, _) = (
-        jax.jit(solve, static_argnums=2)(mass, jacobian, layout, row_hessian, vector)
-        for solve in (hessian.solve_regularised, hessian.solve)
-    )
+    solve = jax.jit(hessian.solve, static_argnums=(2, 5))
+    (expected, _), (unmended, _) = (solve(mass, jacobian, layout, row_hessian, vector, shift) for shift in (most, 0.0))
     assert not np.isfinite(unmended[:, 0]).all()
     assert np.isfinite(expected).all()
     # A condition of 1e4 in single precision.
