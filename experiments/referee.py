@@ -6,6 +6,7 @@ contact through many time steps; the slope of the engine's outcomes over them is
 engine that cannot be installed, or lacks what a scene needs, costs its rows and nothing else.
 """
 
+import functools
 import json
 import math
 import os
@@ -136,16 +137,17 @@ class Outcome:
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
-    """Ask every engine about every scene."""
+    """Ask every contestant about every scene."""
     sizes = settings.sizes
     cells, missing, versions = [], [], {}
     asked = {name: scene for name, scene in scenes(sizes.num_starts).items() if name in sizes.scenes}
-    with workspace.stage("engines", "engines", len(sizes.engines)) as advance_to:
-        for name in sizes.engines:
-            found = workspace.once(name, lambda name=name: _judge(name, asked, sizes.budget))
-            cells, missing, versions[name] = cells + found[0], missing + found[1], found[2]
-            advance_to(len(versions))
-    return Outcome(settings, cells, missing, versions, _machine())
+    contestants = [(name, variant) for name in sizes.engines for variant in ENGINES[name]["variants"]]
+    with workspace.stage("contestants", "contestants", len(contestants)) as advance_to:
+        for i, one in enumerate(contestants):
+            found = workspace.once(" ".join(one), functools.partial(_judge, *one, asked, sizes.budget))
+            cells, missing, versions[one[0]] = cells + found[0], missing + found[1], found[2]
+            advance_to(i + 1)
+    return Outcome(settings, cells, list(dict.fromkeys(missing)), versions, _machine())
 
 
 def scenes(num_starts: int) -> dict[str, dict[str, Any]]:
@@ -156,24 +158,20 @@ def scenes(num_starts: int) -> dict[str, dict[str, Any]]:
     return {name: scene | own.get(name, {}) | {"name": name, "values": values[name]} for name, scene in SCENES.items()}
 
 
-def _judge(name: str, asked: dict[str, Any], budget: float) -> tuple[list[Cell], list[str], str]:
+def _judge(name: str, variant: str, asked: dict[str, Any], budget: float) -> tuple[list[Cell], list[str], str]:
     engine = ENGINES[name]
-    request = {"scenes": asked, "variants": engine["variants"], "packages": engine["packages"], "budget": budget}
+    request = {"scenes": asked, "variants": [variant], "packages": engine["packages"], "budget": budget}
     try:
         python = environment(name, engine["requires"])
     except (OSError, subprocess.SubprocessError) as error:
         told = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
         return [], [f"{name}: not installed: {told}."], "not installed"
     versions, *answers = ask(python, _FOLDER / f"{engine['program']}.py", request) or [{}]
-    cells, missing = [], []
-    for scene in asked:
-        for variant in engine["variants"]:
-            mine = (one for one in answers if (one["scene"], one["variant"]) == (scene, variant))
-            answer = next(mine, {"error": f"no answer within {_ANSWER} s, or it crashed"})
-            if "error" in answer:
-                missing.append(f"{name} {variant}: no {scene}: {answer['error']}.")
-            else:
-                cells.append(cell(name, answer, engine.get("precision", "float64")))
+    by_scene = dict.fromkeys(asked, {"error": f"no answer within {_ANSWER} s, or it crashed"})
+    by_scene |= {one["scene"]: one for one in answers}
+    missing = [f"{name} {variant}: no {s}: {one['error']}." for s, one in by_scene.items() if "error" in one]
+    told = [one for one in by_scene.values() if "error" not in one]
+    cells = [cell(name, one, engine.get("precision", "float64")) for one in told]
     return cells, missing, ", ".join(map(" ".join, versions.items()))
 
 
