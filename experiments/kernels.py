@@ -28,8 +28,10 @@ KERNELS: dict[str, tuple[str, str, Any]] = {
     "logistic": ("logistic", ZEROTH, stats.logistic(scale=_SIZE / (2 * np.log(2)))),
     "log_barrier": ("log barrier", ONSET, stats.t(2, scale=_SIZE / np.sqrt(2))),
 }
-_NEAR = np.linspace(-2, 4, 121)  # distances, in lengths
-_SAMPLED = slice(0, 100, 10)  # those where forces are sampled; farther off few samples touch
+_NEAR, _SAMPLED = (
+    np.linspace(-2, 4, 121),
+    slice(0, None, 10),
+)  # distances in lengths, and those where forces are sampled
 _FAR, _TOLD = np.geomspace(0.1, 100, 31), (10, 20)  # the table tells those at 1 and 10
 # Its impedance is the same at every depth, so that the law is exactly a mean.
 _BALL = """<mujoco model="ball"><option gravity="0 0 0" tolerance="1e-12"/><worldbody>
@@ -37,7 +39,6 @@ _BALL = """<mujoco model="ball"><option gravity="0 0 0" tolerance="1e-12"/><worl
   <geom size=".1" mass="1" priority="1" condim="1" solimp="0.9 0.9"/></body></worldbody></mujoco>"""
 _GOAL, _ARRIVED = (0.05, 0.15, 0.4), 0.02  # pose of the rod (m, m, rad), and how near it must be (m)
 _PUSH_LENGTH = 0.05  # m, of the noise around the rod when planning begins; it falls to a fiftieth
-_PARTS = 20
 _plan = eqx.filter_jit(optimise_trajectory)
 
 
@@ -46,7 +47,7 @@ class Settings(RunSettings):
 
     length: Positive
     """Length of the noise under the ball (m)."""
-    num_samples: Annotated[int, Field(ge=200)]
+    num_samples: Annotated[int, Field(ge=100)]
     """Samples of the noise for each mean of forces."""
     gaps: tuple[Positive, ...]
     """Gaps between finger and rod at the start of a push (m)."""
@@ -115,17 +116,18 @@ def _means(settings: Settings, name: str, forces: np.ndarray) -> np.ndarray:
     """Return means of MuJoCo's force over samples of the noise, and their standard errors.
 
     They are by its inverse dynamics, at the smoothed step's acceleration: the mean is over the law, not over the motion.
-    Samples are stratified, in independent parts whose spread gives the error: Student's t alone has no variance.
+    Quantiles are v², weighed by 2v: forces under Student's t alone, which go as 1/v, have no variance.
     """
     model, random, samples = mujoco.MjModel.from_xml_string(_BALL), np.random.default_rng(settings.seed), []
-    data, count = mujoco.MjData(model), settings.num_samples // _PARTS
+    data = mujoco.MjData(model)
     for r, force in zip(_NEAR[_SAMPLED], forces[_SAMPLED], strict=True):
-        for w in KERNELS[name][2].ppf((np.arange(count) + random.uniform(size=(_PARTS, count))) / count).ravel():
+        quantiles = random.uniform(size=settings.num_samples)
+        for v, w in zip(quantiles, KERNELS[name][2].ppf(quantiles**2), strict=True):
             data.qpos[:], data.qacc[:] = settings.length * (r + w), force
             mujoco.mj_inverse(model, data)
-            samples.append(data.qfrc_constraint[0])
-    each = np.reshape(samples, (-1, _PARTS, count)).mean(axis=2)
-    return np.stack([each.mean(axis=1), each.std(axis=1, ddof=1) / np.sqrt(_PARTS)])
+            samples.append(2 * v * data.qfrc_constraint[0])
+    each = np.reshape(samples, (-1, settings.num_samples))
+    return np.stack([each.mean(axis=1), each.std(axis=1) / np.sqrt(settings.num_samples)])
 
 
 def _miss(name: str, gap: float) -> float:

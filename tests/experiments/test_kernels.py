@@ -14,7 +14,7 @@ SETTINGS = Settings(experiment="kernels", length=4e-3, num_samples=200, gaps=(0.
 
 def kernel(off, misses):
     """Forces of 1 N, whose means are off by so many standard errors at one distance."""
-    means = np.stack([np.ones(10), np.full(10, 0.1)])
+    means = np.stack([np.ones(13), np.full(13, 0.1)])
     means[0, 3] += 0.1 * off
     return Kernel(np.ones(121), np.stack([np.ones(31), -np.ones(31)]), means, np.array(misses))
 
