@@ -168,7 +168,7 @@ def _judge(name: str, variant: str, asked: dict[str, Any], budget: float) -> tup
         return [], [f"{name}: not installed: {told}."], "not installed"
     versions, *answers = ask(python, _FOLDER / f"{engine['program']}.py", request) or [{}]
     nothing = {"error": f"no answer within {_ANSWER} s, or it crashed"}
-    by_scene = {scene: nothing for scene in asked} | {one["scene"]: one for one in answers}
+    by_scene = dict.fromkeys(asked, nothing) | {one["scene"]: one for one in answers}
     missing = [f"{name} {variant}: no {s}: {one['error']}." for s, one in by_scene.items() if "error" in one]
     told = [one for one in by_scene.values() if "error" not in one]
     cells = [cell(name, one, engine.get("precision", "float64")) for one in told]
