@@ -80,9 +80,8 @@ def _between(model: mjx.Model, data: mjx.Data, groups: list[_Group]) -> tuple[Fo
     centre, axis, other, other_axis = _placed(data, pairs)
     (radius, half), (other_radius, other_half) = (_sizes(model, geoms) for geoms in pairs.T)
     apart = centre - other
-    cosine, ahead, behind = _products(
-        jnp.concatenate([axis, other_axis], axis=1), jnp.concatenate([other_axis, apart], axis=1)
-    ).T
+    factors = jnp.concatenate([axis, other_axis], axis=1), jnp.concatenate([other_axis, apart], axis=1)
+    cosine, ahead, behind = _products(*factors).T
     across = cross(axis, other_axis)
     sine2 = dot(across, across)
     # Below this squared sine axes count as parallel, and the nearest point is the middle of the first.

@@ -199,11 +199,8 @@ def _greatest(contact, score: Float[Array, " contacts"], count: int):
 
 
 def _box_box(model: mjx.Model, data: mjx.Data, _, geoms: _Pairs) -> capsules.Found:
-    first, second = (
-        boxes.Box(pick(geom, data.geom_xpos), pick(geom, data.geom_xmat), pick(geom, model.geom_size))
-        for geom in geoms.T
-    )
-    dist, pos, frame = jax.vmap(boxes.box_box)(first, second)
+    places = data.geom_xpos, data.geom_xmat, model.geom_size
+    dist, pos, frame = jax.vmap(boxes.box_box)(*(boxes.Box(*(pick(geom, x) for x in places)) for geom in geoms.T))
     return dist.reshape(-1), pos.reshape(-1, 3), frame.reshape(-1, 3, 3)
 
 
@@ -262,12 +259,8 @@ def _arcs_intersect(a: _Point, b: _Point, c: _Point, d: _Point) -> Bool[Array, "
     return jnp.all(sides > _ALIGNED) | jnp.all(sides < -_ALIGNED)
 
 
-_convex = copy_of(
-    "collision_convex",
-    _arcs_intersect=_arcs_intersect,
-    _closest_segment_point_plane=_closest_segment_point_plane,
-    _project_poly_onto_poly_plane=_project_poly_onto_poly_plane,
-)
+_mended = (_arcs_intersect, _closest_segment_point_plane, _project_poly_onto_poly_plane)
+_convex = copy_of("collision_convex", **{function.__name__: function for function in _mended})
 _convex._create_contact_manifold = partial(_half_way, _convex._create_contact_manifold)
 # MJX decides between faces and edges by the distances of all four: repeated contacts are marked after that.
 _convex._sat_gaussmap = partial(_once, _convex._sat_gaussmap)

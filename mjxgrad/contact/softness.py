@@ -101,13 +101,12 @@ class Softness(eqx.Module):
             return named_pairs(everything, self.pairs, "pairs")
         if self.geoms is None:
             return everything
-        known = {name for pair in everything for name in pair.names}
-        for name in self.geoms:
-            if name not in known:
-                raise ValueError(
-                    f"geoms must name geoms that can touch another, got {name!r}; "
-                    f"those that can: {', '.join(sorted(known)) or 'none'}"
-                )
+        known = sorted({name for pair in everything for name in pair.names})
+        if unknown := [name for name in self.geoms if name not in known]:
+            there = ", ".join(known) or "none"
+            raise ValueError(
+                f"geoms must name geoms that can touch another, got {unknown[0]!r}; those that can: {there}"
+            )
         return tuple(pair for pair in everything if set(pair.names) & set(self.geoms))
 
     def apply(self, model: mjx.Model) -> mjx.Model:
@@ -125,9 +124,7 @@ class Softness(eqx.Module):
         for name in _REQUIREMENTS:
             shape = np.shape(getattr(self, name))
             if shape and not (name == "impedance" and shape == (2,)):
-                raise ValueError(
-                    f"{name} must be one value to be applied, got shape {shape}; apply a sweep under jax.vmap"
-                )
+                raise ValueError(f"{name} must be one value to be applied, got shape {shape}; sweep under jax.vmap")
         self = self._with_nan_for_what_is_refused()
         selected = self.selected(model)
         before = contact_parameters(model, selected)
@@ -168,10 +165,8 @@ class Softness(eqx.Module):
             stiffness = before.stiffness
             refuse(stiffness, "stiffness", "give Softness a stiffness")
             if self.rest_acceleration is not None and is_known(before.margin) and np.any(before.margin):
-                raise ValueError(
-                    "stiffness must be given with rest_acceleration where contacts have a margin already, got none; their "
-                    "present stiffness may have been made for that margin"
-                )
+                wanted = "must be given with rest_acceleration where contacts have a margin already, got none"
+                raise ValueError(f"stiffness {wanted}; their present stiffness may have been made for that margin")
         if damping_ratio is None:
             damping_ratio = before.damping_ratio
             refuse(damping_ratio, "damping_ratio", "give Softness a damping_ratio")
@@ -200,10 +195,9 @@ def _with_margin(model: mjx.Model, margin: Array, pairs: Pairs, explicit: list[i
     """Write the margin to explicit pairs, and half of it to each geom of other pairs, since MuJoCo adds the two."""
     for pair in pairs:
         if any(model.geom_type[geom] in _WITHOUT_MARGIN for geom in (pair.geom1, pair.geom2)):
-            raise ValueError(
-                f"margin must not be set for the pair {pair}: MJX finds contacts of meshes and height fields only "
-                "where they touch; select other pairs, or replace the mesh by primitive geoms"
-            )
+            reason = "MJX finds contacts of meshes and height fields only where they touch"
+            remedy = "select other pairs, or replace the mesh by primitive geoms"
+            raise ValueError(f"margin must not be set for the pair {pair}: {reason}; {remedy}")
     _refuse_shared_geoms(model, pairs, _summed_geoms)
     geom_margin, pair_margin = model.geom_margin, model.pair_margin
     if geoms := sorted({geom for pair in pairs for geom in _summed_geoms(pair)}):
@@ -232,11 +226,9 @@ def _refuse_shared_geoms(model: mjx.Model, selected: Pairs, geoms_of: Callable[[
         for geom in geoms_of(other):
             if geom in decided_by:
                 name = other.names[0] if geom == other.geom1 else other.names[1]
-                raise ValueError(
-                    f"softness of the pair {decided_by[geom]} would also change the pair {other}, which shares the geom "
-                    f"{name!r}; select that pair too, or list one of the two as <pair> in the MJCF's <contact> so that it "
-                    "has its own parameters"
-                )
+                effect = f"softness of the pair {decided_by[geom]} would also change the pair {other}"
+                remedy = "list one of the two as <pair> in the MJCF's <contact> so that it has its own parameters"
+                raise ValueError(f"{effect}, which shares the geom {name!r}; select that pair too, or {remedy}")
 
 
 def _refuse_disagreement(model: mjx.Model, selected: Pairs, values: Array, part: str, remedy: str) -> None:
@@ -248,7 +240,5 @@ def _refuse_disagreement(model: mjx.Model, selected: Pairs, values: Array, part:
         for geom in deciding_geoms(model, pair):
             j = first.setdefault(geom, i)
             if not np.isclose(known[i], known[j], rtol=1e-5):
-                raise ValueError(
-                    f"{part} must be given, or be the same now in the pairs {selected[j]} and "
-                    f"{pair}, which share a geom, got {known[j]:.4g} and {known[i]:.4g}; {remedy}"
-                )
+                both = f"{selected[j]} and {pair}, which share a geom, got {known[j]:.4g} and {known[i]:.4g}"
+                raise ValueError(f"{part} must be given, or be the same now in the pairs {both}; {remedy}")

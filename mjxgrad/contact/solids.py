@@ -156,9 +156,8 @@ def places_on_axis(centre: _Vector, axis: _Vector, half: _Vector) -> tuple[Float
     last, edge = jnp.argmin(of_ends) == 1, jnp.argmax(of_edges <= jnp.min(of_edges) + slack)
     is_face = jnp.min(of_edges) >= jnp.min(of_ends) - slack
     way, corner = (jnp.asarray(x, axis.dtype)[edge] for x in (_WAYS, _SIDES))
-    place, on_edge, passed = (
-        jnp.sum(jnp.where(jnp.arange(12) == edge, x, 0.0)) for x in (places, on_edges, ends_of_edges)
-    )
+    of_all, is_chosen = (places, on_edges, ends_of_edges), jnp.arange(12) == edge
+    place, on_edge, passed = (jnp.sum(jnp.where(is_chosen, x, 0.0)) for x in of_all)
     place = jnp.where(is_face, jnp.where(last, 1.0, -1.0), place)
     corner = corner + way * jnp.where(passed > 0, 1.0, -1.0)
     of_edge = _from_edge(axis, half, corner, way > 0, on_edge)
