@@ -16,16 +16,8 @@ from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
 
 __all__ = [
-    "ActionTask",
-    "BallWall",
-    "Outcome",
-    "SceneTask",
-    "Task",
-    "ball_wall",
-    "hopper",
-    "scene_path",
-    "wall_softness",
-]
+    "ActionTask", "BallWall", "Outcome", "SceneTask", "Task", "ball_wall", "hopper", "scene_path", "wall_softness",
+]  # fmt: skip
 
 # Beside the package in a checkout, inside it when installed from a wheel.
 _FOLDERS = (Path(__file__).parents[1] / "mjcf", Path(__file__).parent / "mjcf")
@@ -128,14 +120,10 @@ def hopper(*, horizon: int = 150) -> ActionTask:
     gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
     offset = stiffness * jnp.array(START_POSE[3:])
     posture = eqx.tree_at(lambda layer: (layer.weight, layer.bias), zero, (gain, offset))
+    state = initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY))
     # The number of controls is the scene's; pyright expects an argument, since `Task` declares a variable.
     return ActionTask(  # pyright: ignore[reportCallIssue]
-        scene=scene,
-        state=initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY)),
-        cost=_jump_cost,
-        horizon=horizon,
-        policy=policy,
-        start_params=posture,
+        scene=scene, state=state, cost=_jump_cost, horizon=horizon, policy=policy, start_params=posture
     )
 
 

@@ -8,25 +8,13 @@ from mjxgrad.envs.gymnasium_robots import ant, half_cheetah, hopper, humanoid, w
 
 ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
     **{make.__name__: make for make in (ant, half_cheetah, hopper, humanoid, walker2d)},
-    **{
-        f"diffrl_{make.__name__}": make
-        for make in (diffrl.ant, diffrl.cartpole, diffrl.half_cheetah, diffrl.hopper, diffrl.humanoid)
-    },
+    **{f"diffrl_{name}": getattr(diffrl, name) for name in ("ant", "cartpole", "half_cheetah", "hopper", "humanoid")},
 }
 
 __all__ = [
-    "ENVIRONMENTS",
-    "EnvState",
-    "Environment",
-    "ant",
-    "diffrl",
-    "half_cheetah",
-    "hopper",
-    "humanoid",
-    "load",
-    "playground",
+    "ENVIRONMENTS", "EnvState", "Environment", "ant", "diffrl", "half_cheetah", "hopper", "humanoid", "load", "playground",
     "walker2d",
-]
+]  # fmt: skip
 
 
 def load(name: str) -> Environment:

@@ -196,19 +196,11 @@ class Environment(InScene):
         memory = self.next_memory(state.memory, action, after, memory_key)
         num_steps = state.num_steps + 1
         obs = self.observe(after, memory)
+        hidden, reward = self.privileged(after, memory), jnp.asarray(sum(terms.values()), obs.dtype)
         terminated = self.is_over(after) | course.diverged
-        return EnvState(
-            physics=after,
-            obs=obs,
-            privileged=self.privileged(after, memory),
-            reward=jnp.asarray(sum(terms.values()), obs.dtype),
-            terminated=terminated,
-            truncated=(num_steps >= self.episode_length) & ~terminated,
-            metrics={**terms, "diverged": course.diverged.astype(obs.dtype)},
-            num_steps=num_steps,
-            memory=memory,
-            key=key,
-        )
+        truncated = (num_steps >= self.episode_length) & ~terminated
+        metrics = {**terms, "diverged": course.diverged.astype(obs.dtype)}
+        return EnvState(after, obs, hidden, reward, terminated, truncated, metrics, num_steps, memory, key)
 
     def step_on(self, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
         """Step, and start a new episode where the step ended one.

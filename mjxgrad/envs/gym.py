@@ -23,6 +23,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 _Info = dict[str, Any]
+_Named = Environment | str
 
 
 class _Adapter:
@@ -30,7 +31,7 @@ class _Adapter:
 
     metadata: _Info = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
-    def _prepare(self, environment: Environment | str, render_mode: str | None, view: _Info) -> None:
+    def _prepare(self, environment: _Named, render_mode: str | None, view: _Info) -> None:
         self.environment = load(environment) if isinstance(environment, str) else environment
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f'render_mode must be "rgb_array" or None, got {render_mode!r}')
@@ -56,7 +57,7 @@ class _Adapter:
 class GymEnv(_Adapter, gymnasium.Env):
     """One copy of an environment, limited by its `episode_length`; `reset` draws what is random in it anew."""
 
-    def __init__(self, environment: Environment | str, *, render_mode: str | None = None, **view: Any):
+    def __init__(self, environment: _Named, *, render_mode: str | None = None, **view: Any):
         """Prepare an environment, or one of `mjxgrad.envs.ENVIRONMENTS` by name; nothing is compiled before `reset` and `step`.
 
         The render mode is "rgb_array" or None. The view is `height`, `width` and `camera` of `mjxgrad.render.frames`, by default
@@ -90,9 +91,7 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
     `final_info` hold the last ones of the old episode.
     """
 
-    def __init__(
-        self, environment: Environment | str, num_envs: int = 1, *, render_mode: str | None = None, **view: Any
-    ):
+    def __init__(self, environment: _Named, num_envs: int = 1, *, render_mode: str | None = None, **view: Any):
         """Prepare `num_envs` copies; the other arguments, and errors, are those of `GymEnv`."""
         self._prepare(environment, render_mode, view)
         self.num_envs = num_envs
@@ -138,10 +137,6 @@ def gym_name(name: str) -> str:
     return f"mjxgrad/{''.join(words)}-v0"
 
 
+_points: _Info = {"entry_point": f"{__name__}:GymEnv", "vector_entry_point": f"{__name__}:GymVectorEnv"}
 for _name in ENVIRONMENTS:
-    gymnasium.register(
-        gym_name(_name),
-        entry_point=f"{__name__}:{GymEnv.__name__}",
-        vector_entry_point=f"{__name__}:{GymVectorEnv.__name__}",
-        kwargs={"environment": _name},
-    )
+    gymnasium.register(gym_name(_name), **_points, kwargs={"environment": _name})

@@ -7,6 +7,8 @@ References:
     Towers et al. Gymnasium: A Standard Interface for Reinforcement Learning Environments. arXiv:2407.17032.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -89,6 +91,7 @@ class Robot(Environment):
 
 
 _PLANAR = {"frame_skip": 4, "control_weight": 1e-3, "alive_reward": 1.0, "speed_limit": 10.0, "noise": 5e-3}
+_FREE: dict[str, Any] = {"frame_skip": 5, "num_unseen": 2}
 
 
 def hopper() -> Robot:
@@ -109,31 +112,14 @@ def half_cheetah() -> Robot:
 
 def ant() -> Robot:
     """Return Ant-v5 without contact forces: four legs, eight motors, 50 ms an action."""
-    return Robot(
-        robot_scene("ant", max_contacts=8),
-        frame_skip=5,
-        control_weight=0.5,
-        alive_reward=1.0,
-        healthy_height=(0.2, 1.0),
-        num_unseen=2,
-        noise=0.1,
-        is_normal=True,
-    )
+    healthy = {"alive_reward": 1.0, "healthy_height": (0.2, 1.0)}
+    return Robot(robot_scene("ant", max_contacts=8), control_weight=0.5, noise=0.1, is_normal=True, **healthy, **_FREE)
 
 
 def humanoid() -> Robot:
     """Return Humanoid-v5 without inertias and forces: seventeen motors, 15 ms an action."""
-    return Robot(
-        robot_scene("humanoid", max_contacts=12),
-        frame_skip=5,
-        forward_weight=1.25,
-        control_weight=0.1,
-        alive_reward=5.0,
-        healthy_height=(1.0, 2.0),
-        num_unseen=2,
-        noise=1e-2,
-        by_mass=True,
-    )
+    scene, healthy = robot_scene("humanoid", max_contacts=12), {"alive_reward": 5.0, "healthy_height": (1.0, 2.0)}
+    return Robot(scene, forward_weight=1.25, control_weight=0.1, noise=1e-2, by_mass=True, **healthy, **_FREE)
 
 
 def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], dtype) -> Float[Array, "*shape"]:
