@@ -170,9 +170,8 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
     try:
         model.names.decode()
     except UnicodeDecodeError as error:
-        raise SceneError(
-            f"{name} must have names in UTF-8, got {error.object[error.start :][:1]!r}; save it so"
-        ) from None
+        given = error.object[error.start :][:1]
+        raise SceneError(f"{name} must have names in UTF-8, got {given!r}; save it so") from None
     if model.nv == 0:
         reason = "so that nothing can move; give a body a joint"
         raise SceneError(f"{name} must have at least one degree of freedom, got none (nv = 0), {reason}")
@@ -278,20 +277,11 @@ def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | 
     # All slots of MJX's data are alike.
     contact = jax.tree.map(lambda x: x[np.zeros(len(dims), int)], data._impl.contact)
     efc_type = make_efc_type(mjx_model, dims)
-    num_equality, num_friction, num_limit, _ = found = counts(efc_type)
-    num_rows = sum(found)
-    rows = {
-        f"_impl.{field.name}": jnp.zeros((num_rows, *value.shape[1:]), value.dtype)
-        for field in data._impl.fields()
-        if field.name.startswith("efc_") and isinstance(value := getattr(data._impl, field.name), jax.Array)
-    }
-    sizes = {
-        "_impl.ne": num_equality,
-        "_impl.nf": num_friction,
-        "_impl.nl": num_limit,
-        "_impl.nefc": num_rows,
-        "_impl.ncon": len(dims),
-        "_impl.efc_type": efc_type,
-        "_impl.contact": contact.replace(dim=dims, efc_address=make_efc_address(mjx_model, dims, efc_type)),
-    }
-    return cast(mjx.Data, data.tree_replace(rows | sizes))
+    contact = contact.replace(dim=dims, efc_address=make_efc_address(mjx_model, dims, efc_type))
+    every = {field.name: getattr(data._impl, field.name) for field in data._impl.fields()}
+    rows = {k: x for k, x in every.items() if k.startswith("efc_") and isinstance(x, jax.Array)}
+    numbers = counts(efc_type)  # of equalities, friction losses, limits and contacts
+    found = {k: jnp.zeros((sum(numbers), *x.shape[1:]), x.dtype) for k, x in rows.items()}
+    found |= dict(zip(("ne", "nf", "nl"), numbers, strict=False)) | {"nefc": sum(numbers), "ncon": len(dims)}
+    found |= {"efc_type": efc_type, "contact": contact}
+    return cast(mjx.Data, data.tree_replace({f"_impl.{k}": x for k, x in found.items()}))
