@@ -35,7 +35,7 @@ from experiments.workspace import Workspace
 from mjxgrad.diagnostics import compare_to_slope, phases
 
 SceneName = Literal["bounce", "push", "slide", "peg", "hopper"]
-EngineName = Literal["mjxgrad", "MJX", "MJX-softened", "brax", "Newton", "jaxsim", "Drake", "MuJoDiCo", "nimble"]
+EngineName = Literal["mjxgrad", "MJX", "MJX-softened", "brax", "Newton", "jaxsim", "Drake", "MuJoDiCo"]
 _FOLDER, _CACHE = Path(__file__).parent / "referee_engines", Path(".cache/referee")
 ENGINES: dict[str, dict[str, Any]] = tomllib.loads((_FOLDER / "engines.toml").read_text(encoding="utf-8"))
 SCENES: dict[str, dict[str, Any]] = tomllib.loads((_FOLDER / "scenes.toml").read_text(encoding="utf-8"))
@@ -68,14 +68,7 @@ class Settings(RunSettings):
 
 @dataclass(frozen=True)
 class Cell:
-    """One contestant in one scene, with errors over the size of the slope; times are median and quartiles.
-
-    Attributes:
-        error: of the mean derivative; infinite where not all derivatives are finite.
-        standard_error: of `error`.
-        scatter: standard deviation of single derivatives.
-        compile_seconds: until the first gradient is there.
-    """
+    """One contestant in one scene, with errors over the size of the slope; times are median and quartiles."""
 
     scene: str
     engine: str
@@ -85,16 +78,16 @@ class Cell:
     outcome: float
     slope: float
     slope_error: float
-    error: float
-    standard_error: float
-    scatter: float
+    error: float  # of the mean derivative; infinite where not all are finite
+    standard_error: float  # of `error`
+    scatter: float  # standard deviation of single derivatives
     seconds: tuple[float, float, float]
     rollout_seconds: tuple[float, float, float]
-    compile_seconds: float
+    compile_seconds: float  # until the first gradient is there
 
     @property
     def is_right(self) -> bool:
-        """Whether the mean derivative is within a tenth of the slope, beyond doubt about either."""
+        """Whether the mean derivative is known to be within a tenth of the slope."""
         return self.error <= _RIGHT and self.standard_error <= _RIGHT
 
     @property
@@ -164,14 +157,14 @@ def _judge(name: str, variant: str, asked: dict[str, Any], budget: float) -> tup
     try:
         python = environment(name, engine["requires"])
     except (OSError, subprocess.SubprocessError) as error:
-        told = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
-        return [], [f"{name}: not installed: {told}."], "not installed"
+        why = (getattr(error, "stderr", None) or str(error)).strip().splitlines()[-1]
+        return [], [f"{name}: not installed: {why}."], "not installed"
     versions, *answers = ask(python, _FOLDER / f"{engine['program']}.py", request) or [{}]
     nothing = {"error": f"no answer within {_ANSWER} s, or it crashed"}
     by_scene = dict.fromkeys(asked, nothing) | {one["scene"]: one for one in answers}
     missing = [f"{name} {variant}: no {s}: {one['error']}." for s, one in by_scene.items() if "error" in one]
-    told = [one for one in by_scene.values() if "error" not in one]
-    cells = [cell(name, one, engine.get("precision", "float64")) for one in told]
+    precision = engine.get("precision", "float64")
+    cells = [cell(name, one, precision) for one in by_scene.values() if "error" not in one]
     return cells, missing, ", ".join(map(" ".join, versions.items()))
 
 
@@ -219,9 +212,8 @@ def cell(engine: str, answer: dict[str, Any], precision: str = "float64") -> Cel
 
 
 def _machine() -> str:
-    about = Path("/proc/cpuinfo")
-    lines = about.read_text(encoding="utf-8").splitlines() if about.is_file() else []
-    name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+    text = about.read_text(encoding="utf-8") if (about := Path("/proc/cpuinfo")).is_file() else ""
+    name = text.partition("model name")[2].partition("\n")[0].lstrip("\t: ") or platform.machine()
     return f"{num_cores()} cores of {name}, Python {platform.python_version()}, {datetime.now(UTC):%Y-%m-%d}"
 
 
@@ -281,15 +273,15 @@ def tables(outcome: Outcome) -> list[Table]:
     return [Table(("contestant", *names), short, caption, frozenset(places)), Table(columns.split(", "), rows, about)]
 
 
-def drawings(outcome: Outcome) -> Drawings:
+def drawings(_: Outcome) -> Drawings:
     """Name the figures."""
     return {"error_against_time": error_against_time}
 
 
 def error_against_time(outcome: Outcome):
     """Error of the mean derivative against seconds of one gradient, a panel per scene."""
-    names, rows = outcome.settings.sizes.scenes, -(-(len(outcome.settings.sizes.scenes) + 1) // 3)
-    figure, axes = subplots(rows, 3, height=3.5 * rows, sharex=True, sharey=True)
+    names = outcome.settings.sizes.scenes
+    figure, axes = subplots(rows := len(names) // 3 + 1, 3, height=3.5 * rows, sharex=True, sharey=True)
     colours = dict(zip(ENGINES, (REFERENCE, ZEROTH, *OTHERS), strict=False))
     for axis in axes.flat[len(names) :]:
         axis.axis("off")
@@ -303,8 +295,7 @@ def error_against_time(outcome: Outcome):
         axis.axhline(_RIGHT, color=MUTED, lw=0.8, ls=(0, (3, 2)))
         axis.set(xscale="log", yscale="log", title=name, ylim=(_LOW / 1.6, _HIGH * 1.6), xlabel="seconds of a gradient")
         plain(axis.xaxis)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("error over slope")
+    figure.supylabel("error over slope")
     named = {label: h for axis in axes.flat for h, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     axes.flat[-1].legend(named.values(), named.keys(), loc="center", fontsize=8, ncols=2)
     caption = (

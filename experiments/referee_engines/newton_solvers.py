@@ -28,14 +28,11 @@ def _build(scene: Scene) -> newton.ModelBuilder:
         builder.add_mjcf(scene["xml"])
         return builder
     look = newton.ModelBuilder.ShapeConfig(density=0.0, ke=scene["stiffness"], kd=scene["damping"], kf=_FRICTION_SLOPE)
-    look.mu = scene["friction"]
-    solid = wp.diag(wp.vec3(*[scene["inertia"]] * 3))
-    for start in scene["starts"]:
-        body = builder.add_body(xform=_at(start), mass=scene["mass"], inertia=solid)
-        for place in scene["balls"]:
-            builder.add_shape_sphere(body, xform=_at(place), radius=scene["radius"], cfg=look)
-    for place, size in scene["sides"]:
-        builder.add_shape_sphere(-1, xform=_at(place), radius=size, cfg=look)
+    look.mu, solid = scene["friction"], wp.diag(wp.vec3(*[scene["inertia"]] * 3))
+    bodies = [builder.add_body(xform=_at(start), mass=scene["mass"], inertia=solid) for start in scene["starts"]]
+    balls = [(body, place, scene["radius"]) for body in bodies for place in scene["balls"]]
+    for body, place, radius in balls + [(-1, *side) for side in scene["sides"]]:
+        builder.add_shape_sphere(body, xform=_at(place), radius=radius, cfg=look)
     if scene["floor"]:
         builder.add_ground_plane(cfg=look)
     return builder
@@ -44,16 +41,14 @@ def _build(scene: Scene) -> newton.ModelBuilder:
 def make(scene: Scene, variant: str) -> Pair:
     """Tape a rollout that finds contacts anew at each step; the states' arrays are kept from call to call."""
     model = _build(scene).finalize(device="cpu", requires_grad=True)
-    solver = _SOLVERS[variant](model)
-    steps, out = round(scene["duration"] / _STEP), wp.zeros(1, dtype=float, requires_grad=True, device="cpu")
-    states, control = [model.state() for _ in range(steps + 1)], model.control()
+    solver, out = _SOLVERS[variant](model), wp.zeros(1, dtype=float, requires_grad=True, device="cpu")
+    states = [model.state() for _ in range(round(scene["duration"] / _STEP) + 1)]
     pipeline = newton.CollisionPipeline(model, broad_phase="explicit", requires_grad=True)
-    contacts = [pipeline.contacts() for _ in range(steps)]
-    first, (kind, index) = states[0], scene["vary"]
+    first, control, contacts = states[0], model.control(), [pipeline.contacts() for _ in states]
+    kind, index = scene["vary"]
     varied = {"qpos": first.joint_q, "qvel": first.joint_qd, "ctrl": control.joint_f}[kind]
     base, speeds = varied.numpy().copy(), first.joint_qd.numpy().copy()
     speeds[0] = scene.get("speed", 0.0)
-    body, axis = (1, 0) if scene["name"] == "push" else (0, scene["read"])
 
     def run(value: float) -> float:
         start = base.copy()
@@ -65,7 +60,8 @@ def make(scene: Scene, variant: str) -> Pair:
             before.clear_forces()
             pipeline.collide(before, contact)
             solver.step(before, after, control, contact, _STEP)
-        wp.launch(_read, dim=1, inputs=[states[-1].body_q, body, axis, out], device="cpu")
+        place = (1, 0) if scene["name"] == "push" else (0, scene["read"])
+        wp.launch(_read, dim=1, inputs=[states[-1].body_q, *place, out], device="cpu")
         return float(out.numpy()[0])
 
     def gradient(value: float) -> tuple[float, float]:

@@ -136,10 +136,10 @@ def test_an_engine_that_cannot_be_installed_costs_its_rows_alone(monkeypatch, tm
 
     monkeypatch.setattr(referee, "_CACHE", tmp_path)
     monkeypatch.setattr(referee.subprocess, "run", refuse)
-    settings = settings_of('sizes.engines=["Drake", "nimble"]', 'sizes.scenes=["slide"]', "sizes.num_starts=32")
+    settings = settings_of('sizes.engines=["Drake", "jaxsim"]', 'sizes.scenes=["slide"]', "sizes.num_starts=32")
     outcome = referee.measure(settings, Workspace(tmp_path))
     assert outcome.missing == [
-        f"{name}: not installed: ERROR: No matching distribution found." for name in ("Drake", "nimble")
+        f"{name}: not installed: ERROR: No matching distribution found." for name in ("Drake", "jaxsim")
     ]
     assert answer(outcome) == "Right within 10% and soonest: nobody in 1 of 1 scenes."
 
@@ -161,7 +161,7 @@ def test_the_page_names_the_fastest_of_those_that_are_right(cells):
         named("MJX-softened", "soft", 0.001),  # right about another motion
     ]
     versions = dict.fromkeys(map(str, settings.sizes.engines), "package 1")
-    outcome = Outcome(settings, entries, ["nimble LCP: no hopper: it loads no MJCF."], versions, "a machine")
+    outcome = Outcome(settings, entries, ["jaxsim soft: no hopper: it loads no MJCF."], versions, "a machine")
     assert answer(outcome) == "Right within 10% and soonest: Drake in 1 and nobody in 1 of 2 scenes."
     assert "slide: Drake sap" in verdict(outcome)
     assert "bounce: nobody" in verdict(outcome)
