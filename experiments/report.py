@@ -18,6 +18,17 @@ _LINK = Markup('<a href="{}/report.html">report</a>')
 _LONG_TABLE = 12  # rows; longer ones are folded
 
 
+class Bold(str):
+    """A cell behind the answer."""
+
+
+def tabulated(rows: Sequence[Mapping[str, str]], caption: str = "") -> Table:
+    """Make a table of rows by heading."""
+    cells = [list(row.values()) for row in rows]
+    bold = ((i, j) for i, row in enumerate(cells) for j, cell in enumerate(row) if isinstance(cell, Bold))
+    return Table(list(rows[0]) if rows else (), cells, caption, frozenset(bold))
+
+
 @dataclass(frozen=True)
 class Figure:
     """A picture: its file, relative to the output folder, a title of a few words, and what it shows and how to read it."""

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Confidence = Annotated[float, Field(gt=0.5, lt=1.0)]
+Several = Annotated[int, Field(ge=2)]
 
 
 class SettingsTable(BaseModel):
@@ -73,23 +75,4 @@ class OwnScene(SettingsTable):
             raise ValueError(f"{', '.join(sorted(given))}: of a scene of one's own; give scene its file, too")
         if self.scene is not None and not Path(self.scene).is_file():
             raise ValueError(f"scene: there is no file {self.scene!r}")
-        if self.cost is not None:
-            _check_cost(self.cost)
         return self
-
-
-def _check_cost(cost: str) -> None:
-    """Refuse the name of a cost whose file is missing, is no Python, or has no such function; the file is not run."""
-    source, _, function = cost.rpartition(":")
-    if not source:
-        raise ValueError(f"cost: must be file.py:function, module:function or height:body, got {cost!r}")
-    if not source.endswith(".py"):
-        return
-    if not Path(source).is_file():
-        raise ValueError(f"cost: there is no file {source}")
-    try:
-        names = compile(Path(source).read_text(encoding="utf-8"), source, "exec").co_names
-    except (SyntaxError, ValueError) as error:
-        raise ValueError(f"cost: {source} is not Python: {error}") from error
-    if function not in names:
-        raise ValueError(f"cost: {source} has no function {function!r}, but {', '.join(names) or 'none'}")

@@ -1,7 +1,7 @@
 """Textbook problems: every estimator against gradients that are known in closed form."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -16,18 +16,16 @@ from pydantic import Field, model_validator
 from scipy import stats
 
 from experiments import theme
-from experiments.optimisation.estimators import estimator
+from experiments.optimisation.measure import estimator
 from experiments.optimisation.settings import MethodSettings
 from experiments.problems import textbook
-from experiments.problems.comparison import Comparison, compare
+from experiments.problems.comparison import compare
 from experiments.problems.textbook import Textbook
-from experiments.report import Table
-from experiments.settings import Finite, Positive, RunSettings
+from experiments.report import Bold, Table, tabulated
+from experiments.settings import Confidence, Finite, Positive, RunSettings, Several
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
 from experiments.words import capitalised, named, quantity
 from experiments.workspace import Workspace
-
-Count = Annotated[int, Field(ge=2)]
 
 
 class Settings(RunSettings):
@@ -41,19 +39,19 @@ class Settings(RunSettings):
     """Of the noise."""
     estimators: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
     """In the order of the legend."""
-    num_samples: Annotated[tuple[Count, ...], Field(min_length=2)]
+    num_samples: Annotated[tuple[Several, ...], Field(min_length=2)]
     """Rollouts per estimate, all that an estimator spends included, for error against rollouts."""
-    num_repeats: Count = 400
+    num_repeats: Several = 400
     """Estimates of each estimator at each setting."""
     stiffness: tuple[Positive, ...] = ()
     """To sweep: 1/width of the soft step, or the frequency of the sine."""
     shown_stiffness: Positive | None = None
     """At which error against rollouts is measured."""
-    samples_at_stiffness: Count = 100
+    samples_at_stiffness: Several = 100
     """Rollouts per estimate in the sweep of stiffness."""
     amplitude: Positive = 0.1
     """Of the sine."""
-    confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
+    confidence: Confidence = 0.95
     """Of every interval."""
 
     @model_validator(mode="after")
@@ -62,7 +60,7 @@ class Settings(RunSettings):
             raise ValueError("stiffness and shown_stiffness must not be set: a step has none; take soft_heaviside")
         if self.problem != "heaviside" and (len(self.stiffness) < 2 or self.shown_stiffness is None):
             raise ValueError(f"{self.problem} needs at least two values of stiffness, and shown_stiffness")
-        if other := [one.label for one in self.estimators if one.is_search or one.name == "reinforce"]:
+        if other := [one.label for one in self.estimators if one.is_baseline]:
             raise ValueError(f"estimators must be of one gradient with noise on the parameters, got {other[0]}")
         if any(one.rule == "bias_constrained" for one in self.estimators):
             raise ValueError("estimators must have rules that need no number, got bias_constrained")
@@ -76,8 +74,8 @@ class Settings(RunSettings):
 class Outcome:
     """All that was measured.
 
-    The sweeps are by `setting` and `estimator`: what `Comparison` has, intervals as `_low` and `_high`, and `exact_rmse`, the
-    root-mean-square error in closed form, NaN where there is none.
+    The sweeps are by `setting` and `estimator`: what `compare` gives, and `exact_rmse`, the root-mean-square error in closed
+    form, NaN where there is none.
     """
 
     settings: Settings
@@ -109,48 +107,33 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     named = {one.label: estimator(one) for one in settings.estimators}
     shown = settings.shown_stiffness
     problem = _problem(settings, shown)
-    samples_key, stiffness_key = jax.random.split(jax.random.key(settings.seed))
-
-    def sweep(key: Array, cells: Sequence[tuple[float | None, int]], done: int) -> xr.Dataset:
-        tables = []
-        for i, (stiffness, rollouts) in enumerate(cells):
-            problem = _problem(settings, stiffness)
-            estimate = functools.partial(
-                compare,
-                named,
-                problem.objective(settings.stddev),
-                jnp.array([settings.point]),
-                jax.random.fold_in(key, i),
-                budget=rollouts,
-                reference=np.reshape(problem.gradient(settings.point, settings.stddev), 1),
-                num_repeats=settings.num_repeats,
-                confidence=settings.confidence,
-            )
-            tables.append(workspace.once(f"{done + i}", estimate))
-            advance_to(done + len(tables))
-        return _dataset(settings, cells, tables)
-
     by_samples = [(shown, rollouts) for rollouts in settings.num_samples]
     by_stiffness = [(stiffness, settings.samples_at_stiffness) for stiffness in settings.stiffness]
-    with workspace.stage("estimates", "settings", len(by_samples) + len(by_stiffness)) as advance_to:
-        over_samples = sweep(samples_key, by_samples, 0)
-        over_stiffness = sweep(stiffness_key, by_stiffness, len(by_samples)) if by_stiffness else None
+
+    def cell(key: Array, stiffness: float | None, rollouts: int) -> xr.Dataset:
+        one = _problem(settings, stiffness)
+        found = compare(
+            named,
+            one.objective(settings.stddev),
+            jnp.array([settings.point]),
+            key,
+            budget=rollouts,
+            reference=float(one.gradient(settings.point, settings.stddev)),
+            num_repeats=settings.num_repeats,
+            confidence=settings.confidence,
+        )
+        exact = [_exact_error(method, settings, stiffness, rollouts) for method in settings.estimators]
+        found = found.assign_coords(stiffness=np.nan if stiffness is None else stiffness)
+        return found.assign(exact_rmse=("estimator", exact))
+
+    keys = jax.random.split(jax.random.key(settings.seed), len(by_samples) + len(by_stiffness))
+    given = zip(keys, [*by_samples, *by_stiffness], strict=True)
+    parts = {f"{i}": functools.partial(cell, key, *one) for i, (key, one) in enumerate(given)}
+    found = workspace.each("estimates", "settings", parts)
+    swept = (found[: len(by_samples)], found[len(by_samples) :])
+    over_samples, *over_stiffness = (xr.concat(one, "setting", coords=["stiffness"]) for one in swept if one)
     gradient = float(problem.gradient(settings.point, settings.stddev))
-    return Outcome(settings, gradient, over_samples, over_stiffness, problem)
-
-
-def _dataset(settings: Settings, cells: Sequence[tuple[float | None, int]], tables: Sequence[Comparison]) -> xr.Dataset:
-    dims, stiffness = ("setting", "estimator"), [np.nan if one is None else one for one, _ in cells]
-    labels = [one.label for one in settings.estimators]
-    data = xr.Dataset(coords={"estimator": labels, "stiffness": ("setting", stiffness)})
-    one_each = ("num_samples", "num_rollouts", "num_finite", "claimed_variance", "variance")
-    for name in (*one_each, "mean", "bias", "rmse"):
-        data[name] = dims, np.stack([getattr(table, name).reshape(len(labels)) for table in tables])
-    for name in ("bias", "rmse"):
-        ends = np.stack([getattr(table, f"{name}_interval").reshape(2, len(labels)) for table in tables], axis=1)
-        data[f"{name}_low"], data[f"{name}_high"] = (dims, ends[0]), (dims, ends[1])
-    exact = [[_exact_error(one, settings, *cell) for one in settings.estimators] for cell in cells]
-    return data.assign(exact_rmse=(dims, exact))
+    return Outcome(settings, gradient, over_samples, next(iter(over_stiffness), None), problem)
 
 
 def _problem(settings: Settings, stiffness: float | None) -> Textbook:
@@ -223,26 +206,25 @@ def tables(outcome: Outcome) -> list[Table]:
     for label in last.estimator.values:
         one = {name: value.item() for name, value in last.sel(estimator=label).data_vars.items()}
         half = {name: (one[f"{name}_high"] - one[f"{name}_low"]) / 2 for name in ("bias", "rmse")}
+        bias = quantity(one["bias"], half["bias"])
         rows.append(
-            [
-                label,
-                str(one["num_samples"]),
-                quantity(one["mean"], half["bias"]),
-                quantity(one["bias"], half["bias"]),
-                quantity(one["rmse"], half["rmse"]),
-                "" if np.isnan(one["exact_rmse"]) else quantity(one["exact_rmse"]),
-                quantity(one["claimed_variance"] ** 0.5),
-            ]
+            {
+                "estimator": label,
+                "samples": str(one["num_samples"]),
+                "mean": quantity(one["mean"], half["bias"]),
+                "bias": Bold(bias) if outcome.is_biased[-1].sel(estimator=label) else bias,
+                "error": quantity(one["rmse"], half["rmse"]),
+                "error, closed form": "" if np.isnan(one["exact_rmse"]) else quantity(one["exact_rmse"]),
+                "error it claims": quantity(one["claimed_variance"] ** 0.5),
+            }
         )
-    columns = ("estimator", "samples", "mean", "bias", "error", "error, closed form", "error it claims")
     caption = (
         f"At {outcome.settings.num_samples[-1]} rollouts per estimate; the gradient is {quantity(outcome.gradient)}. "
         f"Half widths are of {outcome.settings.confidence:.0%} intervals. A bias in bold differs from zero beyond chance "
         "over all numbers of rollouts. The last column is the root of the mean squared standard error of the estimates: "
         "an estimator that claims less than its error hides something."
     )
-    emphasised = frozenset((int(row), 3) for row in np.flatnonzero(outcome.is_biased[-1]))
-    return [Table(columns, rows, caption, emphasised)]
+    return [tabulated(rows, caption)]
 
 
 def _closest(outcome: Outcome) -> str:
@@ -362,8 +344,7 @@ def samples(outcome: Outcome):
 def stiffness(outcome: Outcome):
     """Root-mean-square error against stiffness."""
     assert outcome.by_stiffness is not None
-    figure, axes = subplots(1, 1, height=4.2)
-    axis, settings = axes[0, 0], outcome.settings
+    (figure, axis), settings = theme.panel(4.2), outcome.settings
     _errors(axis, np.asarray(settings.stiffness), outcome.by_stiffness)
     axis.set_xlabel(stiffness_name(outcome))
     theme.legend_below(figure, axis, 4)

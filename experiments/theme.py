@@ -14,17 +14,32 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Picture
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from experiments.report import Figure
 from experiments.words import superscript
 from mjxgrad.report import INK, STYLE, svg
 
-# Okabe and Ito's palette (2008); first and zeroth order keep their colours in every figure.
+# Okabe and Ito's palette (2008).
 FIRST, ZEROTH, REFERENCE = "#d55e00", "#0072b2", INK
 DEFAULT, MUTED, ONSET = "#cc79a7", "#8b94a1", "#009e73"
+# Of a method in every figure.
+COLOURS = {
+    "first order": FIRST,
+    "zeroth order": ZEROTH,
+    "zeroth order (zero noise)": "#56b4e9",
+    "control variate": DEFAULT,
+    "α-order": ONSET,
+    "α-order (bias constrained)": "#b58900",
+    "α-order (concavity)": "#6b6ecf",
+    "α-order (inverse variance)": "#843c39",
+    "REINFORCE": "#7f3c8d",
+    "cross-entropy": "#3b4452",
+    "MPPI": "#8c6d31",
+    "predictive sampling": MUTED,
+}
 # For what comes besides, in order; told apart by their markers, too.
-OTHERS = (ONSET, DEFAULT, "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", MUTED, "#393b79")
+OTHERS = (ONSET, DEFAULT, "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", MUTED, "#393b79", "#17becf", "#bcbd22", "#e377c2")
 MARKERS = "osD^vP*X<>"
 WIDTH = 11.0  # inches, of a page
 
@@ -37,6 +52,12 @@ def subplots(rows: int, columns: int, *, height: float, **settings):
     # Titles, ticks and legends read the rules when they are made, so a context around this call would not reach them.
     plt.style.use(STYLE)
     return plt.subplots(rows, columns, figsize=(WIDTH, height), squeeze=False, **settings)
+
+
+def panel(height: float) -> tuple[Picture, Axes]:
+    """Make a figure of one panel, of a height in inches."""
+    figure, axes = subplots(1, 1, height=height)
+    return figure, axes[0, 0]
 
 
 def save(drawings: Drawings, outcome: Any, folder: Path) -> list[Figure]:
@@ -68,10 +89,19 @@ def power(value: float) -> str:
 
 
 def looks(labels: Iterable[str]) -> list[dict[str, Any]]:
-    """Give each line its colour and marker; first and zeroth order have their colours everywhere."""
-    fixed, others = {"first order": FIRST, "zeroth order": ZEROTH}, itertools.cycle(OTHERS)
+    """Give each line its colour and marker; methods have their colours everywhere, others those that are left."""
+    labels = list(labels)
+    taken = {COLOURS.get(label) for label in labels}
+    others = itertools.cycle(colour for colour in OTHERS if colour not in taken)
     pairs = zip(labels, itertools.cycle(MARKERS))
-    return [{"color": fixed.get(label) or next(others), "marker": marker} for label, marker in pairs]
+    return [{"color": COLOURS.get(label) or next(others), "marker": marker} for label, marker in pairs]
+
+
+def logarithmic(*axes: Axis) -> None:
+    """Make axes logarithmic, with numbers at whole powers of ten alone."""
+    for axis in axes:
+        axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+        axis.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Picture, axis: Axes, columns: int) -> None:

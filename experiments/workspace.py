@@ -9,7 +9,7 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -62,6 +62,15 @@ class Workspace:
                 file.flush()
                 os.fsync(file.fileno())
             partial.replace(path)
+        return found
+
+    def each(self, stage: str, unit: str, parts: Mapping[str, Callable[[], _Found]]) -> list[_Found]:
+        """Compute the parts of a stage by name, one after another and each `once`."""
+        found = []
+        with self.stage(stage, unit, len(parts)) as advance_to:
+            for name, compute in parts.items():
+                found.append(self.once(name, compute))
+                advance_to(len(found))
         return found
 
     @contextlib.contextmanager

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +17,17 @@ import mjxgrad as mg
 from experiments.config import ExperimentError
 from experiments.motion import own_task
 from experiments.optimisation import searches
-from experiments.optimisation.estimators import estimator
 from experiments.optimisation.published import TASKS, Published
 from experiments.optimisation.settings import MethodSettings, Settings
-from experiments.problems.comparison import affordable, bias_interval
+from experiments.problems.comparison import affordable
 from experiments.workspace import Workspace
 from mjxgrad.checking.motions import half_range
 from mjxgrad.diagnostics import mean_interval
-from mjxgrad.estimators import Reason
+from mjxgrad.estimators import Reason, rules
 
+REASONS = (
+    "inverse_variance", "bias_limit", "uncertain", "inconsistent", "not_finite", "nothing_felt", "fixed", "inside"
+)  # fmt: skip
 # Costs are sums over hundreds of steps; seeds that agree to this share differ by rounding alone.
 ROUNDING = 1e-6
 
@@ -102,10 +105,9 @@ class Difference:
     @classmethod
     def of(cls, ours: Run, other: Run, confidence: float) -> "Difference":
         """Compare two methods."""
-        errors = [run.spread / np.sqrt(max(run.kept.size, 1)) for run in (ours, other)]
-        low, high = bias_interval(
-            ours.mean, errors[0], ours.kept.size, other.mean, errors[1], other.kept.size, confidence
-        )
+        with catch_warnings():
+            simplefilter("ignore")  # seeds that agree, or too few of them
+            low, high = stats.ttest_ind(ours.kept, other.kept, equal_var=False).confidence_interval(confidence)
         # Rounded, so that runs that are the same but for rounding tie.
         size = max(ROUNDING * abs(other.mean), 1e-300) if other.kept.size else 1.0
         first, second = (np.where(run.is_lost, np.inf, np.round(run.final_cost / size)) for run in (ours, other))
@@ -210,6 +212,23 @@ def problem(settings: Settings) -> Published:
     return replace(found, **chosen, reference={}) if chosen else found
 
 
+_RULES = {
+    "least_risk": rules.LeastRisk,
+    "inverse_variance": rules.InverseVariance,
+    "concavity": rules.Concavity,
+    "trust_region": rules.TrustRegion,
+}
+
+
+def estimator(method: MethodSettings, gamma: float = 0.0, bound: float = 0.0) -> functools.partial:
+    """Return an estimator, its options bound; the rule "bias_constrained" takes the published constants of a task."""
+    options = method.options
+    if method.rule is not None:
+        is_published = method.rule == "bias_constrained"
+        options["rule"] = rules.BiasConstrained(gamma, bound) if is_published else _RULES[method.rule]()
+    return functools.partial(getattr(mg.estimators, method.name), **options)
+
+
 def runner(method: MethodSettings, task: Published, key: Key[Array, ""]) -> Callable[..., mg.Optimisation]:
     """Give the function that runs a method, of keys, one per seed, and of the options of `mg.optimise`.
 
@@ -252,13 +271,11 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     if settings.scene is not None:
         workspace.check(own_task(settings).scene)
     key = jax.random.key(settings.seed)
-    runs = []
-    with workspace.stage("optimisation", "methods", len(settings.methods)) as advance_to:
-        for i, method in enumerate(settings.methods):
-            # Other noise for every method: the tests of their differences take runs to be independent.
-            run = functools.partial(_run, method, task, settings, jax.random.fold_in(key, i))
-            runs.append(workspace.once(f"{i}", run))
-            advance_to(len(runs))
+    # Other noise for every method: the tests of their differences take runs to be independent.
+    parts = {
+        f"{i}": functools.partial(_run, method, task, settings, jax.random.fold_in(key, i))
+        for i, method in enumerate(settings.methods)
+    }
     return Outcome(
         settings=settings,
         num_samples=task.num_samples,
@@ -266,7 +283,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         dim=task.params.size,
         start_cost=float(jax.jit(task.final_cost)(task.params)),
         reference=dict(task.reference),
-        runs=runs,
+        runs=workspace.each("optimisation", "methods", parts),
     )
 
 
@@ -303,15 +320,5 @@ def _before(totals: np.ndarray, steps: np.ndarray) -> np.ndarray:
 def _reasons(history: mg.History) -> dict[str, np.ndarray]:
     # Steps that a run did not do have no α.
     was_done = ~np.isnan(history.alpha)
-    names = [
-        "fixed",
-        "inverse_variance",
-        "bias_limit",
-        "uncertain",
-        "inconsistent",
-        "not_finite",
-        "nothing_felt",
-        "inside",
-    ]
-    found = {name: np.asarray(history.reason == getattr(Reason, name)) & was_done for name in names}
+    found = {name: np.asarray(history.reason == getattr(Reason, name)) & was_done for name in REASONS}
     return {name: where for name, where in found.items() if where.any()}

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator
 from scipy.stats import mannwhitneyu
 
 from experiments.optimisation.measure import Difference, Outcome, Run
-from experiments.report import MOST_WORDS, Table
-from experiments.theme import FIRST, MUTED, REFERENCE, ZEROTH, Drawings, power, subplots
+from experiments.report import MOST_WORDS, Bold, Table, tabulated
+from experiments.theme import REFERENCE, Drawings, logarithmic, looks, panel, power, subplots
 from experiments.words import capitalised, percent, quantity
 
 # A column in the page over a sweep.
@@ -60,42 +60,33 @@ def warnings(outcome: Outcome) -> list[str]:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all methods."""
-    worse = {difference.ours.method.label for difference in outcome.verdicts if difference.is_above}
-    rows, emphasised = [], set()
-    for i, run in enumerate(outcome.runs):
-        if run.method.label in worse or run.method.label == outcome.best.method.label:
-            emphasised.add((i, 1))
-        if run.is_lost.any():
-            emphasised.add((i, 4))
+    told = {outcome.best.method.label, *(one.ours.method.label for one in outcome.verdicts if one.is_above)}
+    rows = []
+    for run in outcome.runs:
         low, high = run.interval(outcome.settings.confidence)
-        published = outcome.published(run)
+        mean, spread = outcome.published(run) or (None, None)
         rows.append(
-            [
-                run.method.label,
-                quantity(run.mean, run.spread),
-                f"{quantity(low)} to {quantity(high)}" if low == low else "",
-                ""
-                if published is None
-                else quantity(published[0], published[1] if np.isfinite(published[1]) else None),
-                f"{run.is_lost.sum()} of {run.is_lost.size}",
-                f"{np.nanmean(run.alpha):.3g}" if run.reasons else "",
-                str(run.rollouts_per_step),
-                f"{1e3 * run.seconds_per_step:.3g}",
-                f"{run.compile_seconds:.1f}",
-            ]
+            {
+                "method": run.method.label,
+                "final cost": (Bold if run.method.label in told else str)(quantity(run.mean, run.spread)),
+                f"{outcome.settings.confidence:.0%} interval of the mean": (
+                    f"{quantity(low)} to {quantity(high)}" if low == low else ""
+                ),
+                "published": "" if mean is None else quantity(mean, spread if spread == spread else None),
+                "lost runs": (Bold if run.is_lost.any() else str)(f"{run.is_lost.sum()} of {run.is_lost.size}"),
+                "mean α": f"{np.nanmean(run.alpha):.3g}" if run.reasons else "",
+                "rollouts per step": str(run.rollouts_per_step),
+                "ms per step": f"{1e3 * run.seconds_per_step:.3g}",
+                "compilation, s": f"{run.compile_seconds:.1f}",
+            }
         )
-    percent = f"{outcome.settings.confidence:.0%}"
-    columns = (
-        "method", "final cost", f"{percent} interval of the mean", "published", "lost runs", "mean α",
-        "rollouts per step", "ms per step", "compilation, s",
-    )  # fmt: skip
     caption = (
         f"Cost without noise after {outcome.num_steps} steps, mean ± standard deviation over {outcome.settings.seeds} "
         f"seeds, from {quantity(outcome.start_cost)} at the start; {outcome.dim} parameters. Lost runs have no finite cost "
         "in the end; they are not in mean and interval. Bold is the lowest mean, and α-order if it is worse than the "
         "better of first and zeroth order. A step's time is that of one seed of all that run at once."
     )
-    return [Table(columns, rows, caption, frozenset(emphasised))]
+    return [tabulated(rows, caption)]
 
 
 def headline(outcome: Outcome) -> dict[str, str]:
@@ -143,23 +134,6 @@ def _signed(difference: Difference) -> str:
     return f"{sign}{quantity(difference.value)}, {difference.confidence:.0%} interval {ends}"
 
 
-# One colour for a method in all figures of all tasks; first and zeroth order have the theme's.
-_COLOURS = {
-    "first order": FIRST,
-    "zeroth order": ZEROTH,
-    "zeroth order (zero noise)": "#56b4e9",
-    "control variate": "#cc79a7",
-    "α-order": "#00795a",
-    "α-order (bias constrained)": "#b58900",
-    "α-order (concavity)": "#6b6ecf",
-    "α-order (inverse variance)": "#843c39",
-    "REINFORCE": "#7f3c8d",
-    "cross-entropy": "#3b4452",
-    "MPPI": "#8c6d31",
-    "predictive sampling": "#8b94a1",
-}
-_OTHERS = ("#17becf", "#bcbd22", "#e377c2", "#393b79", "#637939", "#ad494a")
-
 # From the best to the worst cost, as a factor; beyond, differences near the best are seen on a logarithmic axis only.
 _WIDE = 3.0
 
@@ -187,8 +161,7 @@ def drawings(outcome: Outcome) -> Drawings:
 
 def final(outcome: Outcome):
     """Final cost of every seed, a row for each method."""
-    figure, axes = subplots(1, 1, height=1.1 + 0.31 * len(outcome.runs))
-    left = axes[0, 0]
+    figure, left = panel(1.1 + 0.31 * len(outcome.runs))
     rows = np.arange(len(outcome.runs))[::-1]
     limit = _limit(outcome)
     for y, run in zip(rows, outcome.runs, strict=True):
@@ -222,8 +195,7 @@ def final(outcome: Outcome):
         left.set_xlim(low - margin, limit + margin)
     left.set(title="Cost without noise after the last step", xlabel="cost")
     _mark_ours(left, outcome.runs)
-    settings = outcome.settings
-    percent = f"{settings.confidence:.0%}"
+    percent = f"{outcome.settings.confidence:.0%}"
     diamonds = "; diamonds are published means ± standard deviations" if outcome.reference else ""
     caption = (
         f"Dots are seeds, bars the means with their {percent} intervals{diamonds}. An arrow stands for a mean ± standard "
@@ -234,7 +206,7 @@ def final(outcome: Outcome):
 
 def curves(outcome: Outcome):
     """Cost without noise against what was spent, the median and the range over seeds."""
-    descents, baselines = _descents(outcome), [run for run in outcome.runs if _is_baseline(run)]
+    descents, baselines = ([run for run in outcome.runs if run.method.is_baseline is kind] for kind in (False, True))
     # What one would otherwise use has α-order as it comes beside it.
     searches = [run for run in outcome.runs if run.method.is_default_alpha] + baselines if baselines else []
     groups = [group for group in (descents, searches) if group]
@@ -244,7 +216,8 @@ def curves(outcome: Outcome):
         for axis, spent in zip(row, ("rollouts", "seconds"), strict=True):
             for run in group:
                 _curve(axis, outcome, run, getattr(run, spent))
-            axis.set_yscale("log")
+            logarithmic(axis.yaxis)
+            axis.yaxis.set_major_formatter(lambda value, _: power(value))
             axis.margins(x=0)
         row[0].set_ylabel(f"cost − {lowest:.4g}")
         row[1].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8.5)
@@ -258,13 +231,9 @@ def curves(outcome: Outcome):
     medians = [float(np.nanmin(np.nanmedian(run.cost, axis=0))) for run in outcome.runs if run.kept.size]
     smallest = min(medians, default=outcome.start_cost) - lowest
     axes[0, 0].set_ylim(max(_floor(outcome), 0.5 * smallest), 1.5 * above)
-    for axis in axes.flat:
-        axis.yaxis.set_major_formatter(lambda value, _: power(value))
-        axis.yaxis.set_minor_formatter(NullFormatter())
-    settings = outcome.settings
     caption = (
-        f"Lines are medians over {settings.seeds} seeds; bands, of α-order and of what ends lowest, reach from the lowest seed "
-        "to the highest. The axis is the cost above the lowest that any run has met, so a line that ends low on the "
+        f"Lines are medians over {outcome.settings.seeds} seeds; bands, of α-order and of what ends lowest, reach from the "
+        "lowest seed to the highest. The axis is the cost above the lowest that any run has met, so a line that ends low on the "
         "logarithmic scale is as good as the best; below, what one would otherwise use, with α-order for comparison. Both "
         "columns are of the same runs; the seconds include the measurement of the noise-free cost, which is no rollout of the "
         "method."
@@ -312,14 +281,6 @@ def alpha(outcome: Outcome):
     return figure, "The weight of the first-order part", caption
 
 
-def _descents(outcome: Outcome) -> list[Run]:
-    return [run for run in outcome.runs if not _is_baseline(run)]
-
-
-def _is_baseline(run: Run) -> bool:
-    return run.method.is_search or run.method.name == "reinforce"
-
-
 def _curve(axis: Axes, outcome: Outcome, run: Run, x: np.ndarray) -> None:
     colour = _colours(outcome)[run.method.label]
     cost = np.maximum(np.where(np.isfinite(run.cost), run.cost, np.nan) - _lowest(outcome), _floor(outcome))
@@ -341,7 +302,7 @@ def _mark_ours(axis: Axes, runs: Sequence[Run]) -> None:
 
 def _limit(outcome: Outcome) -> float:
     """Give the highest final cost to show: methods that fail would set the scale, and hide how the others differ."""
-    shown = [float(cost) for run in _descents(outcome) for cost in run.kept]
+    shown = [float(cost) for run in outcome.runs if not run.method.is_baseline for cost in run.kept]
     shown += [found[0] for run in outcome.runs if (found := outcome.published(run)) is not None]
     if not shown:
         return outcome.start_cost
@@ -360,15 +321,13 @@ def _floor(outcome: Outcome) -> float:
 
 
 def _log_scale(axis: Axes) -> None:
-    axis.set_xscale("log")
+    logarithmic(axis.xaxis)
     low, high = axis.xaxis.get_view_interval()
     subs = (1.0,) if high > 30 * low else (1.0, 2.0, 5.0)
     axis.xaxis.set_major_locator(LogLocator(subs=subs, numticks=12))
     axis.xaxis.set_major_formatter(lambda value, _: power(value))
-    axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _colours(outcome: Outcome) -> dict[str, str]:
     labels = [run.method.label for run in outcome.runs]
-    others = iter(_OTHERS)
-    return {label: _COLOURS.get(label) or next(others, MUTED) for label in labels}
+    return {label: look["color"] for label, look in zip(labels, looks(labels), strict=True)}

@@ -4,9 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.settings import OwnScene, Positive, RunSettings, SettingsTable
-
-Count = Annotated[int, Field(ge=2)]
+from experiments.settings import Confidence, OwnScene, Positive, RunSettings, SettingsTable, Several
 
 SEARCHES = ("cross_entropy", "mppi", "predictive_sampling")
 
@@ -51,6 +49,11 @@ class MethodSettings(SettingsTable):
         return self.name in SEARCHES
 
     @property
+    def is_baseline(self) -> bool:
+        """Say whether this is what one would otherwise use."""
+        return self.is_search or self.name == "reinforce"
+
+    @property
     def is_default_alpha(self) -> bool:
         """Say whether this is α-order as it comes."""
         return self.name == "alpha_order" and self.options == {}
@@ -87,17 +90,17 @@ class Settings(OwnScene, RunSettings):
     """Of the noise on each control of an own scene, in halves of its range."""
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]
     """In the order of the table."""
-    seeds: Count = 10
+    seeds: Several = 10
     """Runs of each method, in one program."""
     num_steps: Annotated[int, Field(ge=1)] | None = None
     """Of each run; without it, as many as published."""
-    num_samples: Count | None = None
+    num_samples: Several | None = None
     """Rollouts per step, all that a method spends included; without it, as many as published."""
     learning_rate: Positive | None = None
     """Of plain gradient descent; without it, as published."""
     evaluations: Annotated[int, Field(ge=1)] = 50
     """How often the cost without noise is measured on the way."""
-    confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
+    confidence: Confidence = 0.95
     """Of every interval."""
 
     @model_validator(mode="after")
