@@ -9,18 +9,21 @@ import pytest
 
 import mjxgrad as mg
 from experiments.__main__ import main
-from experiments.policy_gradient.measure import (
+from experiments.policy_gradient import (
     Cell,
     Estimated,
     Outcome,
+    Settings,
+    answer,
+    drawings,
     estimated,
     jackknife_error,
     share_along,
     squared_distance,
     squared_norm,
+    tables,
+    verdict,
 )
-from experiments.policy_gradient.report import answer, drawings, tables, verdict
-from experiments.policy_gradient.settings import Settings
 from experiments.theme import save
 
 SETTINGS = Settings(
