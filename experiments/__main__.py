@@ -18,28 +18,16 @@ app = cyclopts.App(
     suppress_keyboard_interrupt=False,
 )
 # Named by their place, for they import JAX, which a configuration is checked before.
-for _name, _help in {
-    "bench": "Measure speed and memory against mjx.step.",
-    "costs": "Measure what onset, slope at MuJoCo's motion and smoothing cost.",
-    "engines": "Measure a gradient by C MuJoCo, by MJX and by hand.",
-    "throughput": "Measure a sweep over softness in one program against ten.",
+for _name, (_place, _help) in {
+    "bench": ("benchmarks:bench", "Measure speed and memory against mjx.step."),
+    "costs": ("benchmarks:costs", "Measure what onset, slope at MuJoCo's motion and smoothing cost."),
+    "engines": ("benchmarks:engines", "Measure a gradient by C MuJoCo, by MJX and by hand."),
+    "throughput": ("benchmarks:throughput", "Measure a sweep over softness in one program against ten."),
+    "rates": ("receding_horizon:rates", "Measure how often a robot can be planned for, beside a plain iLQR."),
+    "gradient-audit": ("gradient_audit:gradient_audit", "Measure along which gradients of a policy its return rises."),
+    "identify-bench": ("identification_bench:identify", "Measure identification against mujoco.sysid."),
 }.items():
-    app.command(f"experiments.benchmarks:{_name}", name=_name, help=_help)
-app.command(
-    "experiments.receding_horizon:rates",
-    name="rates",
-    help="Measure how often a robot can be planned for, beside a plain iLQR.",
-)
-app.command(
-    "experiments.gradient_audit:gradient_audit",
-    name="gradient-audit",
-    help="Measure along which gradients of a policy its return rises.",
-)
-app.command(
-    "experiments.identification_bench:identify",
-    name="identify-bench",
-    help="Measure identification against mujoco.sysid.",
-)
+    app.command(f"experiments.{_place}", name=_name, help=_help)
 
 
 def _is_named(_: type, path: Path) -> None:

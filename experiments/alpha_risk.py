@@ -1,12 +1,12 @@
 """The risk bench: squared errors of α-order and of the parts that it mixes, on closed forms, tasks and robots."""
 
 import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +15,15 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import own_task
+from experiments.motion import ASSETS, own_task
 from experiments.optimisation.published import TASKS
 from experiments.problems import textbook
-from experiments.report import Table
+from experiments.report import Bold, Table, tabulated
 from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, ZEROTH, Drawings, subplots
 from experiments.words import percent, quantity
 from experiments.workspace import Workspace
+from mjxgrad.checking.motions import half_range
 from mjxgrad.estimators import rules
 from mjxgrad.estimators.mixture import both_parts, weigh
 from mjxgrad.estimators.samples import Plan, Samples, plan_by_noise, sample
@@ -106,14 +107,12 @@ class Outcome:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per cell, for metrics.csv."""
-        rows = []
-        for cell in self.cells:
-            row = {
-                name: getattr(cell, name)
-                for name in ("problem", "derivative", "dim", "batch", "ratio", "alpha", "truth_error")
-            }
-            rows.append(row | {f"error, {name}": value for name, value in cell.error.items()})
-        return rows
+        names = ("problem", "derivative", "dim", "batch", "ratio", "alpha", "truth_error")
+        return [
+            {name: getattr(cell, name) for name in names}
+            | {f"error, {name}": value for name, value in cell.error.items()}
+            for cell in self.cells
+        ]
 
     @property
     def told(self) -> list[Cell]:
@@ -140,33 +139,23 @@ class _Problem:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Estimate each problem by batches of its rollouts."""
-    made = _problems(settings)
-    cells = []
-    with workspace.stage("estimates", "problems", len(made)) as advance_to:
-        for i, make in enumerate(made):
-            cells += workspace.once(
-                f"{i}", functools.partial(_cells, make, settings, jax.random.key(settings.seed + i))
-            )
-            advance_to(i + 1)
-    return Outcome(settings, cells)
+    parts = {
+        f"{i}": functools.partial(_cells, make, settings, jax.random.key(settings.seed + i))
+        for i, make in enumerate(_problems(settings))
+    }
+    return Outcome(settings, list(itertools.chain(*workspace.each("estimates", "problems", parts))))
 
 
 def _problems(settings: Settings) -> list[Callable[[], _Problem]]:
     if settings.scene is not None:
         return [functools.partial(_own, settings, name) for name in ("discrete", "slope")]
-    made: list[Callable[[], _Problem]] = []
-    for name in settings.textbook:
-        made += [
-            functools.partial(_closed_form, settings, name, at, dim) for at in settings.points for dim in settings.dims
-        ]
-    made += [
-        functools.partial(_published, settings, name, steps) for name in settings.tasks for steps in (0, settings.later)
-    ]
-    made += [functools.partial(_throw, settings, stiffness) for stiffness in settings.walls]
-    made += [
-        functools.partial(_robot, settings, name, kind) for name in settings.robots for kind in ("discrete", "slope")
-    ]
-    return made
+    swept = {
+        _closed_form: (settings.textbook, settings.points, settings.dims),
+        _published: (settings.tasks, (0, settings.later)),
+        _throw: (settings.walls,),
+        _robot: (settings.robots, ("discrete", "slope")),
+    }
+    return [functools.partial(make, settings, *each) for make, by in swept.items() for each in itertools.product(*by)]
 
 
 def _closed_form(settings: Settings, name: str, at: float, dim: int) -> _Problem:
@@ -208,11 +197,10 @@ def _throw(settings: Settings, stiffness: float) -> _Problem:
 
 # Time steps of a rollout.
 _HORIZONS = {"hopper": 50, "walker2d": 50, "half_cheetah": 50, "ant": 30}
-_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
 
 def _robot(settings: Settings, name: str, kind: str) -> _Problem:
-    scene = mg.load_scene(str(_ASSETS / f"{name}.xml")).with_engine("mujoco")
+    scene = mg.load_scene(str(ASSETS / f"{name}.xml")).with_engine("mujoco")
     start, forwards = mg.initial_state(scene), lambda trajectory: -trajectory.qpos[-1, 0]
     task = mg.SceneTask(scene, start, forwards, horizon=_HORIZONS[name])  # pyright: ignore[reportCallIssue]
     return _of_task(settings, name, kind, task)
@@ -225,11 +213,9 @@ def _own(settings: Settings, kind: str) -> _Problem:
 
 def _of_task(settings: Settings, name: str, kind: str, task: mg.SceneTask) -> _Problem:
     contact = {"discrete": mg.Discrete(), "slope": mg.Slope()}[kind]
-    ranges = np.asarray(task.scene.model.actuator_ctrlrange)
-    is_limited = np.asarray(task.scene.model.actuator_ctrllimited).astype(bool)
-    halves = np.where(is_limited, (ranges[:, 1] - ranges[:, 0]) / 2, 1.0)
-    middle = np.where(is_limited, ranges.mean(axis=1), 0.0)
-    width = settings.stddev * jnp.broadcast_to(jnp.asarray(halves), (task.horizon, len(halves)))
+    model = task.scene.model
+    middle = np.where(model.actuator_ctrllimited, np.mean(model.actuator_ctrlrange, axis=1), 0.0)
+    width = settings.stddev * jnp.broadcast_to(jnp.asarray(half_range(task.scene)), (task.horizon, len(middle)))
     objective = mg.open_loop(task.with_contact(contact), width)
     params = jnp.tile(jnp.asarray(middle), task.horizon)
     truth = functools.partial(_by_many, settings, mg.open_loop(task, width), params, _antithetic)
@@ -349,20 +335,23 @@ def _ratio(cell: Cell, name: str) -> float:
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all cells."""
     shown = (FIRST_ORDER, ZEROTH_ORDER, "control variate", "concavity (DDCG)", ALPHA)
-    rows, emphasised = [], set()
-    for i, cell in enumerate(outcome.told):
+    rows = []
+    for cell in outcome.told:
         low, high = cell.ratio_interval
-        errors = [quantity(cell.error[name]) for name in shown]
-        told = [f"{cell.alpha:.2f}", f"{cell.ratio:.2f} ({low:.2f} to {high:.2f})"]
-        rows.append([cell.problem, cell.derivative, str(cell.dim), str(cell.batch), *errors, *told])
-        if high < 0.9:
-            emphasised.add((i, len(rows[-1]) - 1))
-    columns = ("problem", "derivative", "numbers", "samples", *shown, "α", "α-order over the better part")
+        row = {
+            "problem": cell.problem,
+            "derivative": cell.derivative,
+            "numbers": str(cell.dim),
+            "samples": str(cell.batch),
+        }
+        row |= {name: quantity(cell.error[name]) for name in shown} | {"α": f"{cell.alpha:.2f}"}
+        ratio = (Bold if high < 0.9 else str)(f"{cell.ratio:.2f} ({low:.2f} to {high:.2f})")
+        rows.append(row | {"α-order over the better part": ratio})
     caption = (
         "Mean squared errors over the squared norm of the gradient. Intervals are of 95 %, over batches. In bold, α-order is "
         "below both parts by more than a tenth."
     )
-    return [Table(columns, rows, caption, frozenset(emphasised))]
+    return [tabulated(rows, caption)]
 
 
 def drawings(outcome: Outcome) -> Drawings:

@@ -27,11 +27,9 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import cyclopts
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -39,11 +37,11 @@ import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
+from experiments.motion import ASSETS
 from experiments.parallel import num_cores
 from mjxgrad._mjx import mjx
 from mjxgrad.tasks import scene_path
 
-ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _SCENES = {
     "two_bodies": scene_path("two_bodies"),
     "hopper": ASSETS / "hopper.xml",

@@ -16,9 +16,9 @@ from scipy.optimize import minimize
 
 import mjxgrad as mg
 from experiments.problems.billiards import Billiards, billiards
-from experiments.report import MOST_WORDS, Table
-from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
-from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
+from experiments.report import MOST_WORDS, Bold, Table, tabulated
+from experiments.settings import Positive, RunSettings, SettingsTable, Several, VideoSettings
+from experiments.theme import MUTED, Drawings, legend_below, looks, panel
 from experiments.video import film, shown_speed
 from experiments.words import capitalised, joined
 from experiments.workspace import Workspace
@@ -40,7 +40,7 @@ class MethodSettings(SettingsTable):
     """Constant force of the start, in N along each axis; below 1.43 the balls do not touch."""
     stddev: Positive = 1e-6
     """Of the noise on each piece of the force at the start, in N; the default is none to speak of."""
-    num_samples: Annotated[int, Field(ge=2)] = 2
+    num_samples: Several = 2
     """Rollouts per step."""
     margin: Positive | None = None
     """By what the contact begins earlier at the start, in m."""
@@ -141,9 +141,9 @@ class Run:
         return max(self.final_cost, self.hard_cost) < 1.01 * hard_optimum()[0]
 
     @property
-    def is_stuck(self) -> bool:
-        """Whether it ends within one per cent of standing still, or above."""
-        return self.final_cost > 0.99 * IDLE
+    def end(self) -> str:
+        """In words; there is no progress within one per cent of standing still, or above."""
+        return "solved" if self.is_solved else "no progress" if self.final_cost > 0.99 * IDLE else "in between"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Outcome:
     """All numbers."""
 
     settings: Settings
-    runs: tuple[Run, ...]  # one per method
+    runs: list[Run]  # one per method
 
     def rows(self) -> list[dict[str, Any]]:
         """Give the cost along each descent, for metrics.csv."""
@@ -169,14 +169,12 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     task = billiards()
     workspace.check(task.scene)
     play = jax.jit(lambda params: task.trajectory(params).qpos)
-    runs = []
-    with workspace.stage("descents", "methods", len(settings.methods)) as advance_to:
-        for i, method in enumerate(settings.methods):
-            key = jax.random.fold_in(jax.random.key(settings.seed), i)
-            descend = functools.partial(_run, method, task, settings, key, play)
-            runs.append(workspace.once(f"{i}", descend))
-            advance_to(len(runs))
-    return Outcome(settings, tuple(runs))
+    keys = jax.random.split(jax.random.key(settings.seed), len(settings.methods))
+    parts = {
+        f"{i}": functools.partial(_run, method, task, settings, keys[i], play)
+        for i, method in enumerate(settings.methods)
+    }
+    return Outcome(settings, workspace.each("descents", "methods", parts))
 
 
 def _run(
@@ -249,8 +247,9 @@ def answer(outcome: Outcome) -> str:
 def verdict(outcome: Outcome) -> str:
     """Say what solves the stroke from balls that do not touch, and what does not."""
     apart = [run for run in outcome.runs if not run.touches_at_start]
-    solved, stuck = [run for run in apart if run.is_solved], [run for run in apart if run.is_stuck]
-    between = [run for run in apart if not run.is_solved and not run.is_stuck]
+    solved, stuck, between = (
+        [run for run in apart if run.end == end] for end in ("solved", "no progress", "in between")
+    )
     sentences = []
     if solved:
         sentences.append(
@@ -264,7 +263,8 @@ def verdict(outcome: Outcome) -> str:
         sentences.append(capitalised("; ".join(rest)) + ".")
     touching = [run for run in outcome.runs if run.touches_at_start]
     if touching:
-        sentences.append(f"From a start that touches: {'; '.join(map(_ending, touching))}.")
+        ends = (f"“{run.method.label}”: {run.end} ({run.final_cost:.3f})" for run in touching)
+        sentences.append(f"From a start that touches: {'; '.join(ends)}.")
     return " ".join(sentences)
 
 
@@ -280,26 +280,24 @@ def findings(outcome: Outcome) -> list[str]:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all descents."""
-    rows = []
-    for run in outcome.runs:
-        costs = [f"{cost:.4f}" for cost in (run.cost[0], run.final_cost, run.hard_cost)]
-        seconds = [f"{time:.1f}" for time in (run.seconds, run.compile_seconds)]
-        touches = "yes" if run.touches_at_start else "no"
-        rows.append([run.method.label, touches, *costs, str(run.num_rollouts), *seconds])
-    costs = ("cost at the start", "best cost", "with hard balls")
-    columns = ("method", "touches at the start", *costs, "rollouts", "s", "s compiling")
-    solved = frozenset((i, 3) for i, run in enumerate(outcome.runs) if run.is_solved)
-    caption = "Costs in m², without noise; bold where the stroke is solved to one per cent."
-    return [Table(columns, rows, caption, solved)]
+    rows = [
+        {
+            "method": run.method.label,
+            "touches at the start": "yes" if run.touches_at_start else "no",
+            "cost at the start": f"{run.cost[0]:.4f}",
+            "best cost": (Bold if run.is_solved else str)(f"{run.final_cost:.4f}"),
+            "with hard balls": f"{run.hard_cost:.4f}",
+            "rollouts": str(run.num_rollouts),
+            "s": f"{run.seconds:.1f}",
+            "s compiling": f"{run.compile_seconds:.1f}",
+        }
+        for run in outcome.runs
+    ]
+    return [tabulated(rows, "Costs in m², without noise; bold where the stroke is solved to one per cent.")]
 
 
 def _listed(runs: list[Run]) -> str:
     return joined(f"“{run.method.label}” ({run.final_cost:.3f})" for run in runs)
-
-
-def _ending(run: Run) -> str:
-    what = "solved" if run.is_solved else "no progress" if run.is_stuck else "in between"
-    return f"“{run.method.label}”: {what} ({run.final_cost:.3f})"
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -309,8 +307,7 @@ def drawings(outcome: Outcome) -> Drawings:
 
 def cost(outcome: Outcome):
     """True cost against steps."""
-    figure, axes = subplots(1, 1, height=4.4)
-    axis = axes[0, 0]
+    figure, axis = panel(4.4)
     for run, look in zip(outcome.runs, looks(run.method.label for run in outcome.runs), strict=True):
         style = (0, (4, 2)) if run.touches_at_start else "-"
         axis.plot(run.steps, run.cost, ls=style, ms=4, label=run.method.label, **look)

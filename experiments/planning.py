@@ -1,6 +1,7 @@
 """Planning: a finger pushes a rod that it does not touch at the start, by linear models with and without smoothing."""
 
 import copy
+import functools
 import itertools
 import time
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from pydantic import Field, model_validator
 
 import mjxgrad as mg
 from experiments.problems.planar_pusher import PlanarPusher, planar_pusher
-from experiments.report import Table
+from experiments.report import Table, tabulated
 from experiments.settings import Finite, Positive, RunSettings, VideoSettings
 from experiments.theme import DEFAULT, FIRST, REFERENCE, ZEROTH, Drawings, plain, shades, subplots
 from experiments.video import film, shown_speed
@@ -28,10 +29,7 @@ from mjxgrad.planning import GoalCost, Plan, Smoother, optimise_trajectory
 from mjxgrad.stepping import Smoothing
 
 Count = Annotated[int, Field(ge=1)]
-NAMES = {
-    "analytic": "analytic",
-    "none": "no smoothing",
-}
+NAMES = {"analytic": "analytic", "none": "no smoothing"}
 
 
 class Settings(RunSettings):
@@ -141,11 +139,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Plan with every kind of linear model that is asked for."""
     task = planar_pusher(finger=settings.finger, goal=settings.goal)
     workspace.check(task.system.scene)
-    attempts = []
-    with workspace.stage("planning", "attempts", len(settings.models)) as advance_to:
-        for model in settings.models:
-            attempts.append(workspace.once(model, lambda model=model: _attempt(task, settings, model)))
-            advance_to(len(attempts))
+    parts = {model: functools.partial(_attempt, task, settings, model) for model in settings.models}
+    attempts = workspace.each("planning", "attempts", parts)
     # The scene itself under the plan's controls, every time step kept.
     system = task.system
     state = mg.initial_state(system.scene, qpos=task.start[: system.scene.model.nq])
@@ -214,16 +209,15 @@ def _one(outcome: Outcome, attempt: Attempt) -> str:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate the attempts."""
-    columns = ("linear models", "solved", "rod from goal", "turn from goal", "iterations without a better step", "time")
     rows = [
-        [
-            NAMES[attempt.model],
-            "yes" if outcome.is_solved(attempt) else "no",
-            f"{1e3 * outcome.distance(attempt):.1f} mm",
-            f"{outcome.angle(attempt):.3f} rad",
-            f"{(attempt.course['step'] == 0).sum()} of {len(attempt.course['step'])}",
-            f"{attempt.seconds:.0f} s",
-        ]
+        {
+            "linear models": NAMES[attempt.model],
+            "solved": "yes" if outcome.is_solved(attempt) else "no",
+            "rod from goal": f"{1e3 * outcome.distance(attempt):.1f} mm",
+            "turn from goal": f"{outcome.angle(attempt):.3f} rad",
+            "iterations without a better step": f"{sum(attempt.course['step'] == 0)} of {len(attempt.course['step'])}",
+            "time": f"{attempt.seconds:.0f} s",
+        }
         for attempt in outcome.attempts
     ]
     off = max(abs(outcome.shown[-1] - outcome.best.states[-1, :5]))
@@ -231,7 +225,7 @@ def tables(outcome: Outcome) -> list[Table]:
         f"Every plan. A rollout of the scene under the first one ends where the planner says, up to {off:.0e} (m, rad). "
         "Times include compilation."
     )
-    return [Table(columns, rows, caption)]
+    return [tabulated(rows, caption)]
 
 
 _COLOURS = {"analytic": ZEROTH, "none": DEFAULT}

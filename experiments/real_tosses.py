@@ -11,12 +11,11 @@ from typing import Annotated, Any, BinaryIO
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.ticker import NullFormatter
 from pydantic import Field
 
 import mjxgrad as mg
 from experiments.config import ExperimentError
-from experiments.report import Table
+from experiments.report import Table, tabulated
 from experiments.settings import Positive, RunSettings, SettingsTable
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.words import joined, quantity
@@ -273,9 +272,8 @@ class Outcome:
         found = []
         for name, values in (GIVEN | {name: fit.values for name, fit in self.fits.items()}).items():
             place, turn, early_place, early_turn = self.judged[name].T
-            ends = (
-                {f"{key}_half_width": x for key, x in self.fits[name].half_width.items()} if name in self.fits else {}
-            )
+            widths = self.fits[name].half_width if name in self.fits else {}
+            ends = {f"{key}_half_width": x for key, x in widths.items()}
             means = {"position_error": place.mean(), "position_median": np.median(place)}
             means |= {"turn_error_degrees": turn.mean(), "turn_median_degrees": np.median(turn)}
             means |= {"early_position_error": early_place.mean(), "early_turn_error_degrees": early_turn.mean()}
@@ -290,18 +288,12 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
         raise ExperimentError(
             f"num_training and num_held_out must be at most {len(paths)} together, for so many tosses"
         )
-    order = np.random.default_rng(settings.seed).permutation(len(paths))[
-        : settings.num_training + settings.num_held_out
-    ]
-    tosses = [read_toss(paths[i]) for i in order]
+    order = np.random.default_rng(settings.seed).permutation(len(paths))
+    tosses = [read_toss(paths[i]) for i in order[: settings.num_training + settings.num_held_out]]
     training, held_out = tosses[: settings.num_training], tosses[settings.num_training :]
     windows = [window for toss in training for window in recordings(toss, settings)]
-    fits: dict[str, Fit] = {}
-    with workspace.stage("searches", "fits", len(FITS)) as advance_to:
-        for name, (names, has_onset) in FITS.items():
-            search = functools.partial(_fit, settings, names, windows, has_onset)
-            fits[name] = workspace.once(name, search)
-            advance_to(len(fits))
+    searches = {name: functools.partial(_fit, settings, one, windows, onset) for name, (one, onset) in FITS.items()}
+    fits = dict(zip(FITS, workspace.each("searches", "fits", searches), strict=True))
     judged, courses = {}, {}
     for name, values in (GIVEN | {name: fit.values for name, fit in fits.items()}).items():
         model = cube(settings.substeps, **values).mj_model
@@ -397,52 +389,38 @@ def _errors(judged: Float[np.ndarray, "tosses 4"]) -> str:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate what was found, and what it is worth."""
-    columns = ["", *(f"{_named(n)} ({u})" if u else _named(n) for n, u in UNITS.items())]
-    rows = [[name, *(f"{_SCALE.get(n, 1.0) * values[n]:.4g}" for n in UNITS)] for name, values in GIVEN.items()]
-    rows += [
-        [name, *(_quantity(fit, n).removesuffix(f" {UNITS[n]}") for n in UNITS)] for name, fit in outcome.fits.items()
+    heads = {n: f"{_named(n)} ({u})" if u else _named(n) for n, u in UNITS.items()}
+    rows = [
+        {"": name} | {head: f"{_SCALE.get(n, 1.0) * values[n]:.4g}" for n, head in heads.items()}
+        for name, values in GIVEN.items()
     ]
-    caption = "Numbers of the cube, with 95% intervals where they were looked for; the others stay nominal."
-    found = Table([*columns], rows, caption)
-    ends = [
-        [
-            name,
-            _signed(off(fit)),
-            *(f"{x:.2f}" for x in (*fit.rms, fit.correlation)),
-            fit.stopped,
-            str(fit.num_steps),
-            f"{fit.seconds:.0f}",
-        ]
+    rows += [
+        {"": name} | {head: _quantity(fit, n).removesuffix(f" {UNITS[n]}") for n, head in heads.items()}
         for name, fit in outcome.fits.items()
     ]
-    heads = ("", "side off by", "rms before", "after", "correlation", "ended", "steps", "s")
-    searched = Table(
-        heads,
-        ends,
-        f"The searches, over {outcome.num_windows} windows; residuals in units of {1e3 * outcome.settings.noise:g} mm.",
-    )
+    caption = "Numbers of the cube, with 95% intervals where they were looked for; the others stay nominal."
+    found = tabulated(rows, caption)
+    ends = [
+        {"": name, "side off by": _signed(off(fit)), "rms before": f"{fit.rms[0]:.2f}", "after": f"{fit.rms[1]:.2f}"}
+        | {"correlation": f"{fit.correlation:.2f}", "ended": fit.stopped, "steps": str(fit.num_steps)}
+        | {"s": f"{fit.seconds:.0f}"}
+        for name, fit in outcome.fits.items()
+    ]
+    units = f"residuals in units of {1e3 * outcome.settings.noise:g} mm"
+    searched = tabulated(ends, f"The searches, over {outcome.num_windows} windows; {units}.")
     worth = []
     for name, judged in outcome.judged.items():
         place, turn, early_place, early_turn = judged.T
-        cells = (100 * place.mean(), 100 * np.median(place), 1e3 * SIDE * place.mean(), turn.mean(), np.median(turn))
-        cells += (1e3 * SIDE * early_place.mean(), early_turn.mean())
-        worth.append([name, *(f"{x:.1f}" for x in cells)])
-    heads = (
-        "",
-        "position, mean (%)",
-        "median (%)",
-        "mean (mm)",
-        "turn, mean (°)",
-        "median (°)",
-        "early (mm)",
-        "early (°)",
-    )
+        cells = {"position, mean (%)": 100 * place.mean(), "median (%)": 100 * np.median(place)}
+        cells |= {"mean (mm)": 1e3 * SIDE * place.mean(), "turn, mean (°)": turn.mean(), "median (°)": np.median(turn)}
+        cells |= {"early (mm)": 1e3 * SIDE * early_place.mean(), "early (°)": early_turn.mean()}
+        worth.append({"": name} | {head: f"{x:.1f}" for head, x in cells.items()})
     caption = (
         f"Error over {outcome.settings.num_held_out} tosses that were held out, rolled out whole from their first state in "
         "C MuJoCo: of the centre, in per cent of the published side, and of the orientation. Early: until 0.1 s after the first "
         "touch. Of Acosta et al. are friction and softness; their cube was a box, with pyramidal cones."
     )
-    return [Table(heads, worth, caption), found, searched]
+    return [tabulated(worth, caption), found, searched]
 
 
 _COLOURS: Mapping[str, str] = {"nominal": MUTED, "fitted by Acosta et al.": ZEROTH, BEST: ONSET}
@@ -475,7 +453,7 @@ def held_out(outcome: Outcome):
             sizes = np.sort(scale * outcome.judged[name][:, column])
             axis.plot(sizes, np.arange(1, len(sizes) + 1) / len(sizes), color=colour, label=name)
         axis.set(xlabel=label, ylabel="share of tosses below", ylim=(0, 1.02), xscale="log")
-        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.minorticks_off()
         axis.set_xticks([2, 5, 10, 20, 50, 100])
         plain(axis.xaxis)
     handles, texts = others[0].get_legend_handles_labels()

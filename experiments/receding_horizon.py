@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 
 import mjxgrad as mg
-from experiments.benchmarks import ASSETS, announce
+from experiments.benchmarks import announce
+from experiments.motion import ASSETS
 from mjxgrad import planning
 from mjxgrad.tasks import scene_path
 

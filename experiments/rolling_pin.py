@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -15,8 +16,8 @@ from pydantic import Field
 
 import mjxgrad as mg
 from experiments.problems.rolling_pin import STIFFNESS, RollingPin, rolling_pin
-from experiments.report import Table
-from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
+from experiments.report import Bold, Table, tabulated
+from experiments.settings import Positive, RunSettings, SettingsTable, Several, VideoSettings
 from experiments.theme import MUTED, Drawings, legend_below, looks, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.words import joined, quantity
@@ -44,9 +45,9 @@ class RemedySettings(SettingsTable):
 class Settings(RunSettings):
     """A dent in a bed that the pin does not touch, by descent along different derivatives."""
 
-    num_steps: Annotated[int, Field(ge=2)] = 60
+    num_steps: Several = 60
     """Of descent."""
-    num_samples: Annotated[int, Field(ge=2)] = 2
+    num_samples: Several = 2
     """Rollouts per step with derivatives."""
     learning_rate: Positive = 0.03
     """Of Adam."""
@@ -56,7 +57,6 @@ class Settings(RunSettings):
     """Of the noise by which zeroth order and α-order search, white in time (10 N)."""
     search_samples: Annotated[int, Field(ge=4)] = 16
     """Rollouts per step of these."""
-    """Of the smoothing."""
     solved_below: Positive = 0.1
     """True cost that counts as solved; the untouched bed has 1."""
     remedies: RemedySettings = RemedySettings()
@@ -116,16 +116,11 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Descend in every way from controls of zero, and judge each by the true cost."""
     task = rolling_pin()
     workspace.check(task.scene)
-    key = jax.random.key(settings.seed)
     slope = jax.jit(jax.grad(task.true_cost))(jnp.zeros(task.horizon * task.num_controls))
-    programs, descents = _programs(settings), []
-    with workspace.stage("descent", "programs", len(programs)) as advance_to:
-        for done, program in enumerate(programs):
-            own = jax.random.fold_in(key, done)
-            descents += workspace.once(
-                f"{done}", lambda program=program, own=own: _descend(task, program, settings, own)
-            )
-            advance_to(done + 1)
+    programs = _programs(settings)
+    keys = jax.random.split(jax.random.key(settings.seed), len(programs))
+    parts = {f"{i}": functools.partial(_descend, task, one, settings, keys[i]) for i, one in enumerate(programs)}
+    descents = list(itertools.chain(*workspace.each("descent", "programs", parts)))
     return Outcome(settings, descents, float(jnp.abs(slope).max()), task)
 
 
@@ -261,21 +256,23 @@ def tables(outcome: Outcome) -> list[Table]:
     rows = []
     for one in outcome.descents:
         steps = one.steps_to(outcome.settings.solved_below)
-        reached = ["never", ""] if steps is None else [str(steps), str(steps * one.num_samples)]
-        costs = [quantity(float(cost)) for cost in (one.costs[-1], one.costs.min())]
-        worst = f"{1e3 * abs(one.heights - target).max():.1f}"
-        rows.append([one.label, str(one.num_samples), *costs, *reached, worst])
-    columns = (
-        "descent along", "rollouts a step", "final true cost", "least true cost", f"steps to stay below {below}",
-        "rollouts for that", "worst pillar (mm)",
-    )  # fmt: skip
+        rows.append(
+            {
+                "descent along": one.label,
+                "rollouts a step": str(one.num_samples),
+                "final true cost": (Bold if outcome.is_solved(one) else str)(quantity(float(one.costs[-1]))),
+                "least true cost": quantity(float(one.costs.min())),
+                f"steps to stay below {below}": "never" if steps is None else str(steps),
+                "rollouts for that": "" if steps is None else str(steps * one.num_samples),
+                "worst pillar (mm)": f"{1e3 * abs(one.heights - target).max():.1f}",
+            }
+        )
     caption = (
         "The true cost is that of the scene as it is, without noise, whatever the descent saw; 1 is the untouched bed. "
         f"In bold what ends below {below}. The last column is the largest distance of a pillar from its wanted height "
         "in the end."
     )
-    solved = frozenset((row, 2) for row, one in enumerate(outcome.descents) if outcome.is_solved(one))
-    return [Table(columns, rows, caption, solved)]
+    return [tabulated(rows, caption)]
 
 
 def _listed(descents: list[Descent]) -> str:

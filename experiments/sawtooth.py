@@ -2,12 +2,12 @@
 
 import copy
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,8 +19,8 @@ from matplotlib.lines import Line2D
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, own_task
-from experiments.report import Table
+from experiments.motion import ARMS, ASSETS, CONTINUOUS, DISCRETE, SLOPE, Read, own_task
+from experiments.report import Table, tabulated
 from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots
 from experiments.words import joined, percent
@@ -51,18 +51,6 @@ class Settings(OwnScene, RunSettings):
     """By what the time step is divided for MuJoCo's converged motion; 0 leaves that comparison out."""
 
 
-_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-
-# From positions and velocities to what is read of a motion.
-_READ: dict[str, Read] = {
-    "planar": lambda qpos, qvel: qpos[:3],
-    "free": lambda qpos, qvel: jnp.array([qpos[0], qpos[2], 2 * (qpos[3] * qpos[5] - qpos[6] * qpos[4])]),
-    "ball": lambda qpos, qvel: jnp.array([qpos[0], qpos[2], qvel[4]]),
-    "two_balls": lambda qpos, qvel: jnp.array([qpos[0], qpos[1], qpos[7], qpos[8]]),
-    "arm": lambda qpos, qvel: qpos[:2],
-}
-
-
 @dataclass(frozen=True)
 class Case:
     """A motion with impacts."""
@@ -85,8 +73,8 @@ def case(name: str) -> Case:
 
 def _robot(title: str, file: str, qpos: dict[int, float], speed: float = 0.5, **other: Any) -> Case:
     """One of gymnasium's robots, dropped while it moves forwards."""
-    planar = {"moved": 1, "labels": ("x", "z", "pitch (rad)"), "read": _READ["planar"]}
-    model = mujoco.MjModel.from_xml_path(str(_ASSETS / file))
+    planar = {"moved": 1, "labels": ("x", "z", "pitch (rad)"), "read": lambda qpos, _: qpos[:3]}
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / file))
     return Case(title, model, interval=(0.0, 0.03), duration=0.5, qpos=qpos, qvel={0: speed}, **planar | other)
 
 
@@ -119,7 +107,7 @@ def _ball_case(cone: str, condim: int, slope: float = 0.0) -> Case:
         moved=2,
         interval=(0.0, 0.03),
         labels=("x", "height", "spin (1/s per m)"),
-        read=_READ["ball"],
+        read=lambda qpos, qvel: jnp.array([qpos[0], qpos[2], qvel[4]]),
         duration=0.24,
         qvel={0: 1.0, 2: -1.5, 3: 2.0, 4: -10.0, 5: 5.0},
     )
@@ -135,7 +123,7 @@ def _two_balls_case(cone: str) -> Case:
         moved=1,
         interval=(0.03, 0.06),
         labels=("first, along", "first, across", "second, along", "second, across"),
-        read=_READ["two_balls"],
+        read=lambda qpos, _: qpos[jnp.array([0, 1, 7, 8])],
         duration=0.24,
         qvel={0: 1.5, 5: 3.0},
     )
@@ -155,7 +143,7 @@ _BUILDERS = {
         speed=0.3,
         moved=2,
         labels=("x", "z", "pitch (sine)"),
-        read=_READ["free"],
+        read=lambda qpos, _: jnp.array([qpos[0], qpos[2], 2 * (qpos[3] * qpos[5] - qpos[6] * qpos[4])]),
     ),
     "ball_frictionless": lambda: _ball_case("pyramidal", 1),
     "ball": lambda: _ball_case("pyramidal", 3),
@@ -172,7 +160,7 @@ _BUILDERS = {
         moved=0,
         interval=(0.0, 0.06),
         labels=("shoulder (rad)", "elbow (rad)"),
-        read=_READ["arm"],
+        read=lambda qpos, _: qpos[:2],
         duration=0.4,
         qpos={0: 0.3, 1: 0.4},
     ),
@@ -312,18 +300,18 @@ def _by_mujoco(
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Sample outcomes and derivatives of every motion at every time step."""
-    courses = []
     if settings.scene is not None:
         with workspace.stage("rollouts", "motions", 1):
             return Outcome([_own_course(settings, workspace)])
-    with workspace.stage("rollouts", "motions", len(settings.cases)) as advance_to:
-        for number, name in enumerate(settings.cases):
-            one = case(name)
-            for h in sorted({float(one.model.opt.timestep), *settings.timesteps}, reverse=True):
-                courses.append(workspace.once(f"{name} {h}", lambda name=name, h=h: _course(name, h, settings)))
-            jax.clear_caches()  # no other motion takes its programs, and a process may have 65 530 pieces of memory
-            advance_to(number + 1)
-    return Outcome(courses)
+
+    def courses(name: str) -> list[xr.Dataset]:
+        timesteps = sorted({float(case(name).model.opt.timestep), *settings.timesteps}, reverse=True)
+        found = [_course(name, timestep, settings) for timestep in timesteps]
+        jax.clear_caches()  # no other motion takes its programs, and a process may have 65 530 pieces of memory
+        return found
+
+    parts = {name: functools.partial(courses, name) for name in settings.cases}
+    return Outcome(list(itertools.chain(*workspace.each("rollouts", "motions", parts))))
 
 
 def _steps_between(one: Case, timestep: float) -> int:
@@ -428,28 +416,25 @@ def findings(outcome: Outcome) -> list[str]:
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate all motions."""
     rows = []
-    for c in outcome.courses:
-        if not c.has_impact.any():
-            continue
+    for c in (one for one in outcome.courses if one.has_impact.any()):
         picked = c.where(c.has_impact)
         middle = picked.median(("time", "coordinate"))
-        right = (c.right & c.has_impact).sum(("time", "coordinate"))
-        row = [str(c.title.values), f"{1e3 * float(c.timestep):g}"]
-        row.append(f"{float(middle.smaller):.0f} ({float(picked.smaller.min()):.1f})")
-        row += [f"{value:.2g}" for value in middle.spread.values] + [f"{value:.1%}" for value in middle.error.values]
-        row += [f"{value} of {int(c.has_impact.sum())}" for value in right.values]
-        row.append(f"{float(middle['shift']):.2f}")
-        rows.append([*row, "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"])
-    columns = ["motion", "time step, ms", "sawtooth smaller, times"]
-    columns += [f"{what}, {arm}" for what in ("spread", "error", "right") for arm in _ARMS]
-    columns += ["shift of the mean", "off the converged motion"]
+        right, count = (c.right & c.has_impact).sum(("time", "coordinate")), int(c.has_impact.sum())
+        row = {"motion": str(c.title.values), "time step, ms": f"{1e3 * float(c.timestep):g}"}
+        row["sawtooth smaller, times"] = f"{float(middle.smaller):.0f} ({float(picked.smaller.min()):.1f})"
+        row |= {f"spread, {arm}": f"{float(middle.spread.sel(arm=arm)):.2g}" for arm in _ARMS}
+        row |= {f"error, {arm}": f"{float(middle.error.sel(arm=arm)):.1%}" for arm in _ARMS}
+        row |= {f"right, {arm}": f"{int(right.sel(arm=arm))} of {count}" for arm in _ARMS}
+        row["shift of the mean"] = f"{float(middle['shift']):.2f}"
+        row["off the converged motion"] = "–" if np.isnan(middle.closer) else f"{float(middle.closer):.2f}"
+        rows.append(row)
     caption = (
         "Medians over times and coordinates with an impact before them; in brackets the least. Spread: standard deviation of "
         "single derivatives about their trend, over the slope. Error: of the mean derivative, over the slope of its own outcome, "
         "sampling errors included; right: readings where it is within two of these or 5%. Shift of the mean outcome over "
         "MuJoCo's sawtooth. Distance of the outcome from the converged motion over MuJoCo's own."
     )
-    return [Table(columns, rows, caption)]
+    return [tabulated(rows, caption)]
 
 
 def _pooled(outcome: Outcome, name: str, arm: str | None = None) -> np.ndarray:

@@ -14,7 +14,7 @@ import mjxgrad as mg
 from experiments import theme
 from experiments.bias_variance.measure import Outcome, wall_contact
 from experiments.bias_variance.settings import ThrowsSettings
-from experiments.report import Table
+from experiments.report import Bold, Table, tabulated
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, power, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
 from experiments.words import joined, quantity
@@ -95,26 +95,22 @@ def verdict(outcome: Outcome) -> str:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate both estimates, the reference and which estimate to use."""
-    table, rows, emphasised = outcome.table, [], set()
+    table, words, rows = outcome.table, _words(outcome), []
     for i, j in np.ndindex(table.bias.shape):
         one = table.isel(stiffness=i, angle=j)
-        if one.is_biased:
-            emphasised.add((len(rows), 5))
-        gradients = [_with_half_width(one, name) for name in ("first_order", "zeroth_order", "reference", "bias")]
         row = f"default ({power(float(one.stiffness))})" if one.is_default else power(float(one.stiffness))
         rows.append(
-            [
-                row if j == 0 else "",
-                f"{float(one.angle):g}",
-                f"{gradients[0]}{' †' if one.has_wrong_sign else ''}",
-                *gradients[1:],
-                quantity(float(one.first_order_variance / one.zeroth_order_variance)),
-                "first" if one.first_wins else "zeroth" if one.zeroth_wins else "either",
-            ]
+            {
+                _titled(words.knob, words.per): row if j == 0 else "",
+                _titled(words.place, words.at): f"{float(one.angle):g}",
+                "first order": f"{_with_half_width(one, 'first_order')}{' †' if one.has_wrong_sign else ''}",
+                "zeroth order": _with_half_width(one, "zeroth_order"),
+                "reference": _with_half_width(one, "reference"),
+                "bias of first order": (Bold if one.is_biased else str)(_with_half_width(one, "bias")),
+                "variance ratio": quantity(float(one.first_order_variance / one.zeroth_order_variance)),
+                "use": "first" if one.first_wins else "zeroth" if one.zeroth_wins else "either",
+            }
         )
-    words = _words(outcome)
-    heads = _titled(words.knob, words.per), _titled(words.place, words.at)
-    found = "first order", "zeroth order", "reference", "bias of first order", "variance ratio", "use"
     settings = outcome.settings
     caption = (
         f"Gradients{words.gradient.replace(',', ' in')} with half the width of their {settings.confidence:.0%} intervals, from "
@@ -123,7 +119,7 @@ def tables(outcome: Outcome) -> list[Table]:
         "zeroth order. The last column is the estimate with the clearly smaller expected error at "
         f"{settings.rollouts_per_gradient} rollouts per gradient."
     )
-    return [Table((*heads, *found), rows, caption, frozenset(emphasised))]
+    return [tabulated(rows, caption)]
 
 
 def _with_half_width(one: xr.Dataset, name: str) -> str:
@@ -273,8 +269,7 @@ def bias_variance(outcome: Outcome):
 def choice(outcome: Outcome):
     """Ratio of expected errors within the budget, for each stiffness and angle."""
     table, budget = outcome.table, outcome.settings.rollouts_per_gradient
-    figure, axes = subplots(1, 1, height=0.55 * table.angle.size + 1.6)
-    axis = axes[0, 0]
+    figure, axis = theme.panel(0.55 * table.angle.size + 1.6)
     ratio = np.log10(table.first_order_error / table.zeroth_order_error).values.T
     bound = max(0.3, np.nanmax(np.abs(ratio)))
     colours = LinearSegmentedColormap.from_list("choice", [FIRST, "#f7f7f5", ZEROTH])

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from experiments.settings import Finite, OwnScene, Positive, RunSettings, VideoSettings
+from experiments.settings import Confidence, Finite, OwnScene, Positive, RunSettings, Several, VideoSettings
 
 
 class ThrowsSettings(VideoSettings):
@@ -33,13 +33,13 @@ class Settings(OwnScene, RunSettings):
     """Of the contacts, the same at every stiffness; 1 is critical."""
     include_default: bool = True
     """Whether the scene's own softness joins the sweep, and is marked."""
-    num_samples: Annotated[int, Field(ge=2)]
+    num_samples: Several
     """Rollouts per estimate."""
     reference_samples: Annotated[int, Field(ge=100)]
     """Rollouts per stiffness for the landscape, from which the reference is taken."""
     rollouts_per_gradient: Annotated[int, Field(ge=1)] = 100
     """The budget for which the report says which estimate to use."""
-    confidence: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.95
+    confidence: Confidence = 0.95
     """Of every interval."""
     video: ThrowsSettings | None = None
     """Of the throws of `ball_wall`."""

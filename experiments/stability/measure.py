@@ -422,7 +422,7 @@ class Program:
             mg.initial_state(scene, qpos, qvel),
             horizon=self._settings.num_steps,
             observe=observe,
-            contact=mg.Onset() if self._settings.onset else mg.Discrete(),
+            contact=mg.Discrete(),
         )
         return trajectory.qpos[-1] @ self._weights, trajectory
 
@@ -497,19 +497,15 @@ def _differences(case: _Case, program: Program) -> Float[np.ndarray, "2 widths p
 
 
 def _of_mjxgrad(case: _Case, run: Run, truth: np.ndarray, in_c: Course, tolerance: float) -> dict[str, np.ndarray]:
-    motion, bound, is_sound = case.motion(run.course), case.largest, run.course.is_sound
-    fields, qpos, qvel = run.gradient
+    motion, (fields, qpos, qvel) = case.motion(run.course), run.gradient
     shift, push = case.pushes
     with np.errstate(all="ignore"):
         by_start = (qpos * shift).sum(axis=1) + (qvel * push).sum(axis=1)
         terms = [(fields[name] * change).reshape(len(qpos), -1).sum(axis=1) for name, change in case.changes.items()]
         slopes = [by_start, np.sum(terms, axis=0) / case.flown]
         apart = np.abs(run.course.qpos - in_c.qpos).max(axis=1) / case.flown
-    is_finite = _all_finite(run.gradient)
-    kinds = [
-        classify_derivative(slope, is_finite, is_sound, one, largest=bound, tolerance=tolerance)
-        for slope, one in zip(slopes, truth, strict=True)
-    ]
+    known, how = (_all_finite(run.gradient), run.course.is_sound), {"largest": case.largest, "tolerance": tolerance}
+    kinds = [classify_derivative(slope, *known, one, **how) for slope, one in zip(slopes, truth, strict=True)]
     return {
         "motion": motion,
         "derivative": kinds[0],

@@ -3,7 +3,6 @@
 import functools
 import re
 from collections import Counter
-from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Patch
 from matplotlib.ticker import PercentFormatter
 
-from experiments.report import Table
+from experiments.report import Table, tabulated
 from experiments.stability.measure import (
     C_MUJOCO,
     GAIN,
@@ -68,20 +67,20 @@ def summary(outcome: Outcome) -> Table:
     rows = []
     for name in outcome.settings.precisions:
         found = outcome.found.sel(simulator=name)
-        right = ["{} of {}".format(*_right(found, key)) for key in ("derivative", "derivative_by_parameters")]
-        rows.append([name, _count(found.motion == Motion.NOT_SOLVED), _count(found.untold), *right])
-    columns = (
-        "precision",
-        "not solved to a thousandth",
-        "not told by Trajectory.unsolved",
-        "right by the start",
-        "by parameters",
-    )
+        rows.append(
+            {
+                "precision": name,
+                "not solved to a thousandth": _count(found.motion == Motion.NOT_SOLVED),
+                "not told by Trajectory.unsolved": _count(found.untold),
+                "right by the start": "{} of {}".format(*_right(found, "derivative")),
+                "by parameters": "{} of {}".format(*_right(found, "derivative_by_parameters")),
+            }
+        )
     caption = (
         "Points. Derivatives by the start, and by contact parameters, friction and time step, where the motion is fine: right of "
         "those that finite differences can judge."
     )
-    return Table(columns, rows, caption)
+    return tabulated(rows, caption)
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -90,29 +89,28 @@ def tables(outcome: Outcome) -> list[Table]:
     for one in outcome.scenes:
         for name in one.found.simulator.values:
             found, label = one.found.sel(simulator=name), name if name == C_MUJOCO else f"mjxgrad, {name}"
-            motions.append([one.scene.name, label, *_cells(found.motion, Motion)])
+            row = {"scene": one.scene.name, "simulator": label}
+            motions.append(row | _cells(found.motion, Motion))
             for key, line in {"derivative": "by the start", "derivative_by_parameters": "by parameters"}.items():
                 if (found[key] != NOT_ASKED).all():
-                    derivatives.append([one.scene.name, label, line, *_cells(found[key], Derivative)])
+                    derivatives.append(row | {"derivative": line} | _cells(found[key], Derivative))
         for precision in outcome.settings.precisions:
+            row = {"scene": one.scene.name, "precision": precision}
             counts = Counter(reasons(one, precision).values())
-            explained += [[one.scene.name, precision, reason, str(count)] for reason, count in counts.most_common()]
+            explained += [row | {"reason": reason, "points": str(count)} for reason, count in counts.most_common()]
     found = [
-        Table(
-            ("scene", "simulator", *(kind.label for kind in Motion)),
+        tabulated(
             motions,
             "Points by what the motion does. “Gains energy” is more kinetic energy than start, gravity and compressed springs "
             "had to give; “not solved” is an acceleration that is off by a thousandth of a step’s velocity, by the forces that "
             "it leaves unbalanced; where these are rounded, in float32, by the forces of the same state in float64.",
         ),
-        Table(
-            ("scene", "simulator", "derivative", *(kind.label for kind in Derivative)),
+        tabulated(
             derivatives,
             "Points by what the derivative is, judged by central differences of mjxgrad in float64; it is unjudged where two "
             "widths disagree.",
         ),
-        Table(
-            ("scene", "precision", "reason", "points"),
+        tabulated(
             explained,
             "Points where the motion of mjxgrad is of a worse kind than that of C MuJoCo, by the reason found.",
         ),
@@ -125,15 +123,15 @@ def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
 
     $h \omega_0 / (2 (\sqrt{1 + \zeta^2} - \zeta))$, in the standard format $h / t_c$ over $2 \zeta (\sqrt{1 + \zeta^2} - \zeta)$.
     """
-    found = np.empty(len(points))
-    for i in range(len(points)):
-        point = points[i]
+
+    def one(point: dict[str, float]) -> float:
         impedance = np.clip((point["impedance_first"], point["impedance_last"]), mujoco.mjMINIMP, mujoco.mjMAXIMP)
         stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
         frequency = np.sqrt(stiffness)
         limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
-        found[i] = point["timestep"] * frequency / limit
-    return found
+        return point["timestep"] * frequency / limit
+
+    return np.array([one(points[i]) for i in range(len(points))])
 
 
 def reasons(one: SceneOutcome, precision: str) -> dict[int, str]:
@@ -168,8 +166,8 @@ def _right(found, key: str) -> tuple[int, int]:
     return int(((kinds == Derivative.RIGHT) & is_fine).sum()), int((judged & is_fine).sum())
 
 
-def _cells(values, kinds: type[Motion] | type[Derivative]) -> list[str]:
-    return [str(count or "") for count in np.bincount(values, minlength=len(kinds))]
+def _cells(values, kinds: type[Motion] | type[Derivative]) -> dict[str, str]:
+    return {kinds(i).label: str(count or "") for i, count in enumerate(np.bincount(values, minlength=len(kinds)))}
 
 
 # In the order of the items.
@@ -243,8 +241,11 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
             values = one.points.plane(i, one.found[what].sel(simulator=name).values)
             # The eye is to find where a column differs from the one that it stands beside.
             model = C_MUJOCO if what == "motion" else precisions[0]
-            same = values == one.points.plane(i, one.found[what].sel(simulator=model).values) if name != model else None
-            _image(axis, values, _MOTIONS if what == "motion" else _DERIVATIVES, same)
+            same = values == one.points.plane(i, one.found[what].sel(simulator=model).values)
+            squares = to_rgba_array(_MOTIONS if what == "motion" else _DERIVATIVES)[np.maximum(values, 0)]
+            squares[..., 3] = np.where(same & (name != model), 0.25, 1.0)
+            axis.imshow(squares, origin="lower", aspect="auto", interpolation="nearest")
+            axis.grid(visible=False)
             _scales(axis, across, up, values.shape[0])
             _limit(axis, one, i)
             if i == 0:
@@ -261,14 +262,6 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
         "diverges there is none."
     )
     return figure, one.scene.name.capitalize(), caption
-
-
-def _image(axis: Axes, values: np.ndarray, colours: Sequence[str], pale: np.ndarray | None) -> None:
-    squares = to_rgba_array(colours)[np.maximum(values, 0)]
-    if pale is not None:
-        squares[pale, 3] = 0.25
-    axis.imshow(squares, origin="lower", aspect="auto", interpolation="nearest")
-    axis.grid(visible=False)
 
 
 def _scales(axis: Axes, across: str, up: str, count: int) -> None:

@@ -73,11 +73,9 @@ class StabilityScene:
 def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData, point: Point) -> None:
     """Set a scene's model to a point of the grid, in place, with all that MuJoCo derives from masses."""
     model.opt.timestep = point["timestep"]
+    solref = (point["time_constant"], point["damping_ratio"])
     if point["stiffness"] > 0:
-        frequency = np.sqrt(point["stiffness"])
-        solref = (-point["stiffness"], -2 * point["damping_ratio"] * frequency)
-    else:
-        solref = (point["time_constant"], point["damping_ratio"])
+        solref = tuple(-x for x in effective(scene, point))
     solimp = (point["impedance_first"], point["impedance_last"], point["width"])
     kinds = ((model.jnt_solref, model.jnt_solimp),) if scene.has_limits else ()
     for references, impedances in (*kinds, (model.geom_solref, model.geom_solimp)):
@@ -137,11 +135,11 @@ def _balls() -> list[StabilityScene]:
     def start(point: Point) -> State:
         return np.array([_above(point)]), np.array([-point["speed"]])
 
-    found = []
-    for name, refsafe in (("ball", "disable"), ("ball, refsafe", "enable")):
-        mjcf, has_refsafe = _mjcf("ball", body, flags=f'refsafe="{refsafe}"'), refsafe == "enable"
-        found.append(StabilityScene(name, mjcf, "ball", start, _alone, (1.0,), has_refsafe=has_refsafe))
-    return found
+    plain, safe = (_mjcf("ball", body, flags=f'refsafe="{refsafe}"') for refsafe in ("disable", "enable"))
+    return [
+        StabilityScene("ball", plain, "ball", start, _alone, (1.0,), has_refsafe=False),
+        StabilityScene("ball, refsafe", safe, "ball", start, _alone, (1.0,)),
+    ]
 
 
 def _spheres() -> list[StabilityScene]:
@@ -152,13 +150,12 @@ def _spheres() -> list[StabilityScene]:
         qpos = np.array([0.0, 0.0, RADIUS + _above(point), 1.0, 0.0, 0.0, 0.0])
         return qpos, np.array([0.5 * speed, 0.2 * speed, -speed, 0.0, 0.3 * speed / RADIUS, 0.1 * speed / RADIUS])
 
-    variants = [(1, "pyramidal"), *((dim, cone) for cone in _CONES for dim in (3, 4, 6))]
-    found = []
-    for dim, cone in variants:
+    def scene(name: str, dim: int, cone: str) -> StabilityScene:
         mjcf = _mjcf("sphere", body, gravity=GRAVITY, cone=cone, condim=dim)
-        name = f"sphere, condim {dim}" + (f", {cone}" if dim > 1 else "")
-        found.append(StabilityScene(name, mjcf, "sphere", start, _alone, _FREE_BODY))
-    return found
+        return StabilityScene(name, mjcf, "sphere", start, _alone, _FREE_BODY)
+
+    others = [scene(f"sphere, condim {dim}, {cone}", dim, cone) for cone in _CONES for dim in (3, 4, 6)]
+    return [scene("sphere, condim 1", 1, "pyramidal"), *others]
 
 
 def _pairs() -> list[StabilityScene]:
@@ -179,13 +176,8 @@ def _pairs() -> list[StabilityScene]:
     def masses(ratio: float) -> list[float]:
         return [MASS * max(1.0, 1 / ratio), MASS * max(1.0, ratio)]
 
-    found = []
-    for cone in _CONES:
-        mjcf = _mjcf("pair", body, cone=cone, condim=3)
-        found.append(
-            StabilityScene(f"two balls, {cone}", mjcf, "two balls", start, masses, weights, crossing=((0, 7),))
-        )
-    return found
+    given = ("two balls", start, masses, weights, ((0, 7),))
+    return [StabilityScene(f"two balls, {cone}", _mjcf("pair", body, cone=cone, condim=3), *given) for cone in _CONES]
 
 
 def _stack() -> StabilityScene:
@@ -219,11 +211,8 @@ def _boxes() -> list[StabilityScene]:
         qpos = np.array([0.0, 0.0, corner + _above(point), np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0])
         return qpos, np.array([0.3 * speed, 0.1 * speed, -speed, 0.0, 0.0, 0.0])
 
-    found = []
-    for cone in _CONES:
-        mjcf = _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3)
-        found.append(StabilityScene(f"box, {cone}", mjcf, "box", start, _alone, _FREE_BODY))
-    return found
+    texts = {cone: _mjcf("box", body, gravity=GRAVITY, cone=cone, condim=3) for cone in _CONES}
+    return [StabilityScene(f"box, {cone}", text, "box", start, _alone, _FREE_BODY) for cone, text in texts.items()]
 
 
 def _chain() -> StabilityScene:

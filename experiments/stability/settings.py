@@ -29,8 +29,6 @@ class Settings(RunSettings):
     """The numbers that go with the size: those of the file's table of that name."""
     num_steps: Annotated[int, Field(ge=20, le=1000)] = 100
     """Of every rollout, whatever its time step."""
-    onset: bool = False
-    """Whether contacts begin within the step, in place of MuJoCo's motion."""
     precisions: Annotated[tuple[Literal["float32", "float64"], ...], Field(min_length=1, max_length=2)] = (
         "float64",
         "float32",

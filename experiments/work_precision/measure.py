@@ -421,12 +421,9 @@ def _gradients(case: Case, programs: dict[Variant, Program], settings: Settings)
     simulate = programs[Variant(MG)]
     derivatives = {names[v.library]: one for v, one in programs.items() if v.has_gradient}
     noise = quasi_random(sizes.num_rollouts, len(case.moved), settings.seed) * case.stddev
-    fine, coarse = (
-        smoothed_gradient(
-            _costs(simulate, noise, factor * case.timestep / _GRADIENT_FINEST, _GRADIENT_TOLERANCE), noise, case.stddev
-        )
-        for factor in (1, 2)
-    )
+    steps = [factor * case.timestep / _GRADIENT_FINEST for factor in (1, 2)]
+    costs = [_rollouts(simulate, noise, step, _GRADIENT_TOLERANCE)[:, 0] for step in steps]
+    fine, coarse = (smoothed_gradient(each, noise, case.stddev) for each in costs)
     right, size = fine[0], np.linalg.norm(fine[0])
     known = float(np.hypot(np.linalg.norm(fine[1]), np.linalg.norm(coarse[0] - right)) / size)
     estimates = []
@@ -470,32 +467,27 @@ def _over_scrambles(samples: Float[np.ndarray, "rollouts dim"]) -> tuple[np.ndar
     return parts.mean(axis=0), parts.std(axis=0, ddof=1) / np.sqrt(_SCRAMBLES)
 
 
-def _costs(
-    simulate: Program, noise: np.ndarray, timestep: float, tolerance: float | None = None
-) -> Float[np.ndarray, " rollouts"]:
-    weights = simulate.case.weights
-    return _in_chunks(simulate, lambda qvel: simulate.timed(qvel, timestep, tolerance)[0][0] @ weights, noise)
-
-
-def _in_chunks(program: Program, run: Callable, noise: np.ndarray) -> np.ndarray:
-    """Run all, a batch at a time; what fills up the last one is cut off."""
+def _rollouts(
+    program: Program, noise: np.ndarray, timestep: float, tolerance: float | None = None
+) -> Float[np.ndarray, "rollouts columns"]:
+    """Simulate all, a batch at a time: the cost of each, and its gradient, zero without a derivative."""
     case, batch = program.case, program.batch
+    # What fills up the last batch is cut off.
     filled = np.concatenate([noise, np.zeros((-len(noise) % batch, noise.shape[1]))])
     starts = (case.start[1] + filled @ case.directions).reshape(-1, batch, case.model.nv)
-    return np.concatenate([run(qvel) for qvel in starts])[: len(noise)]
+    ends = [program.timed(qvel, timestep, tolerance)[0] for qvel in starts]
+    if not program.variant.has_gradient:
+        ends = [(qpos @ case.weights, np.zeros((batch, noise.shape[1]))) for qpos, _ in ends]
+    return np.concatenate([np.column_stack(one) for one in ends])[: len(noise)]
 
 
 def _record(program: Program, noise: np.ndarray, timestep: float, settings: Settings) -> tuple[Recorded, list[float]]:
-    """Simulate at one time step; gradients are zero without a derivative. The times of one rollout go with it."""
+    """Simulate at one time step. The times of one rollout go with it."""
     case, batch, dim = program.case, program.batch, noise.shape[1]
     first = case.start[1] + np.resize(noise, (batch, dim)) @ case.directions
     _, taken = repeated(program, first, timestep, settings.sizes)
-    if program.variant.has_gradient:
-        both = _in_chunks(program, lambda qvel: np.column_stack(program.timed(qvel, timestep)[0]), noise)
-        costs, gradients = both[:, 0], both[:, 1:]
-    else:
-        costs, gradients = _costs(program, noise, timestep), np.zeros_like(noise)
-    arrays = {"costs": costs, "gradients": gradients, "noise": noise, "stddev": np.full(dim, case.stddev)}
+    found = _rollouts(program, noise, timestep)
+    arrays = {"costs": found[:, 0], "gradients": found[:, 1:], "noise": noise, "stddev": np.full(dim, case.stddev)}
     record = Recorded(**{name: jnp.asarray(each) for name, each in arrays.items()}, dim=dim)
     return record, [one / batch for one in taken]
 

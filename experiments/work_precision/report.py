@@ -8,11 +8,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter
 
 from experiments.parallel import num_cores
-from experiments.report import Table
-from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, subplots
+from experiments.report import Table, tabulated
+from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, logarithmic, subplots
 from experiments.words import joined, percent, quantity
 from experiments.work_precision.measure import MG, MJX, ONSET, C, Course, Estimate, Outcome, Point
 
@@ -111,21 +110,20 @@ def findings(outcome: Outcome) -> list[str]:
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate what to take for which error, scene by scene."""
     targets = sorted(outcome.settings.targets, reverse=True)
-    columns = ["scene", "reference known to", "to compile mg.step; mjx.step, s"]
-    for share in map(percent, targets):
-        columns += [f"motion to {share}", "ms per s; mjx.step; C MuJoCo", f"gradient to {share}"]
     rows = []
     for course in outcome.courses:
-        row = [
-            course.title,
-            _share(course.floor(MG)),
-            "; ".join(f"{course.compile_seconds[one]:.1f}" for one in (MG, MJX)),
-        ]
+        row = {
+            "scene": course.title,
+            "reference known to": _share(course.floor(MG)),
+            "to compile mg.step; mjx.step, s": "; ".join(f"{course.compile_seconds[one]:.1f}" for one in (MG, MJX)),
+        }
         for target in targets:
-            best = [_best(course, name, target) for name in (MG, MJX, C)]
+            best, share = [_best(course, name, target) for name in (MG, MJX, C)], percent(target)
             nothing = "?" if course.floor(MG) > target else "–"
+            row[f"motion to {share}"] = nothing if best[0] is None else _way(best[0])
             costs = "; ".join("–" if one is None else _milliseconds(one.cost) for one in best)
-            row += [nothing if best[0] is None else _way(best[0]), costs, _choice(cheapest(course.estimates, target))]
+            row[f"ms per s; mjx.step; C MuJoCo, to {share}"] = costs
+            row[f"gradient to {share}"] = _choice(cheapest(course.estimates, target))
         rows.append(row)
     caption = (
         "What reaches an error in the least time: of the motion by mg.step, with milliseconds per simulated second of one "
@@ -133,7 +131,7 @@ def tables(outcome: Outcome) -> list[Table]:
         f"{_threads()}; of the gradient, with its rollouts, as many as bias and variance call for, and their time. A dash: "
         "no setting gets there; a question mark: the reference is not known so well."
     )
-    return [Table(columns, rows, caption)]
+    return [tabulated(rows, caption)]
 
 
 def _best(course: Course, library: str, target: float) -> Point | None:
@@ -210,8 +208,8 @@ def _all_scenes(outcome: Outcome):
                 axis.plot(found[1:], [place] * len(found[1:]), ms=4, mfc="white", **look)
     for axis, title, side in zip(axes[0], ("motion", "gradient"), ("left", "right"), strict=True):
         what = "second of motion and state" if title == "motion" else "estimate"
-        axis.set(title=f"time to an error of the {title}", xscale="log", xlabel=f"seconds per {what}")
-        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.set(title=f"time to an error of the {title}", xlabel=f"seconds per {what}")
+        logarithmic(axis.xaxis)
         figure.legend(*axis.get_legend_handles_labels(), fontsize=8, loc=f"outside lower {side}", ncols=3)
     axes[0, 0].set_ylim(-0.6, count - 0.4)
     axes[0, 0].set_yticks(range(count), [course.title for course in outcome.courses])
@@ -256,8 +254,8 @@ def _drawn(course: Course, outcome: Outcome):
         axis.axhline(max(known, _SMALLEST), **_KNOWN)
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
-        axis.set(xscale="log", yscale="log", xlabel=f"wall-clock {what}")
-        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.set(yscale="log", xlabel=f"wall-clock {what}")
+        logarithmic(axis.xaxis)
     left.set(title="error of the final state, relative", ylabel="error")
     right.set(title="error of the gradient, relative")
     names = {variant.integrator for variant in (one.variant for one in course.points)}
