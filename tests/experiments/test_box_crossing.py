@@ -39,6 +39,10 @@ def test_a_step_of_least_squares_on_capsules_beats_the_published_loss(capsules):
     assert descend(capsules, "least_squares", 1).loss[-1] < 0.074
 
 
+def test_what_capsules_find_holds_on_cylinders(capsules):
+    assert float(box_crossing().loss(descend(capsules, "least_squares", 6).params)) < 0.074
+
+
 def test_cylinders_have_derivatives_only_where_their_contacts_are_found_finely():
     norms = [descend(box_crossing(ccd_tolerance=x), "first_order", 1).gradient_norm[0] for x in (1e-14, 1e-6)]
     fine, usual = norms
