@@ -20,6 +20,7 @@ except ImportError:
     print("the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'", file=sys.stderr)
     sys.exit(2)
 
+Switch = Annotated[bool, cyclopts.Parameter(negative="")]
 Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
 
 
@@ -86,8 +87,8 @@ def check(
     *,
     cost: str | None = None,
     html: Path | None = None,
-    quick: Annotated[bool, cyclopts.Parameter(negative="")] = False,
-    mjx: Annotated[bool, cyclopts.Parameter(negative="")] = False,
+    quick: Switch = False,
+    mjx: Switch = False,
     budget: float = 12.0,
     seed: Whole = 0,
 ) -> int:
@@ -146,20 +147,10 @@ def sweep(
     """
     _writable(html, is_page=True)
     mg, log = _library(), _timed()
-    found = mg.sweep(
-        _existing(scene),
-        cost,
-        **({} if stiffness is None else {"stiffness": stiffness}),
-        noise=noise,
-        num_samples=samples,
-        num_reference=16 * samples,
-        seed=seed,
-        log=log,
-        start=start,
-        horizon=horizon,
-        contact=mg.stepping.own_motion(gradient),
-        engine=engine,
-    )
+    given = {} if stiffness is None else {"stiffness": stiffness}
+    given |= {"noise": noise, "num_samples": samples, "num_reference": 16 * samples, "seed": seed, "log": log}
+    given |= {"start": start, "horizon": horizon, "contact": mg.stepping.own_motion(gradient), "engine": engine}
+    found = mg.sweep(_existing(scene), cost, **given)
     print(found, flush=True)
     write(html, found.as_html())
     log(f"wrote {html}")
@@ -219,19 +210,11 @@ def identify(
             log(left_out[-1].strip())  # a slip is seen before the search
         motions.append(dataclasses.replace(one, start=mg.initial_state(loaded)) if start == "exact" else one)
     fitted, judged = files.hold_out(motions, held_out)
-    log(
-        f"{len(wanted)} parameters, {len(fitted)} motion{'s' * (len(fitted) > 1)} to fit, {len(judged)} held out; compiling"
-    )
-    result = mg.identify(
-        loaded,
-        wanted,
-        fitted,
-        held_out=judged,
-        delay="delay" if "delay" in wanted else None,
-        free_start=True if start == "free" else None,
-        max_steps=max_steps,
-        log=lambda step, metrics: log(f"step {step}: error {metrics['rms']:.3g} {unit}"),
-    )
+    several = "s" * (len(fitted) > 1)
+    log(f"{len(wanted)} parameters, {len(fitted)} motion{several} to fit, {len(judged)} held out; compiling")
+    say = lambda step, metrics: log(f"step {step}: error {metrics['rms']:.3g} {unit}")  # noqa: E731
+    given = {"delay": "delay" if "delay" in wanted else None, "free_start": True if start == "free" else None}
+    result = mg.identify(loaded, wanted, fitted, held_out=judged, max_steps=max_steps, log=say, **given)
     print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)
     output.mkdir(parents=True, exist_ok=True)
     result.save(output / "params_x_hat.yaml")
@@ -243,9 +226,7 @@ def identify(
 
 
 @app.command
-def new(
-    scene: str, *, output: Path = Path("task.py"), force: Annotated[bool, cyclopts.Parameter(negative="")] = False
-) -> None:
+def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) -> None:
     """Write a program that optimises a motion of a scene and films it, with the settings that a quick check recommends.
 
     Args:

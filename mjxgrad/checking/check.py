@@ -89,11 +89,8 @@ class Verdict(Paged):
         lines = ["Nothing."]
         if self.measured:
             lines = [f"Outcomes: {'; '.join(self.outcomes)}.", *map(_noise_text, self.measured.noises)]
-        return {
-            "What was measured": "\n".join(lines),
-            "The scene": self.scene.summary(),
-            "Time step and contacts": self.stability.summary(),
-        }
+        scene, steps = self.scene.summary(), self.stability.summary()
+        return {"What was measured": "\n".join(lines), "The scene": scene, "Time step and contacts": steps}
 
     def as_html(self) -> str:
         """Return the verdict as a self-contained page; needs `mjxgrad[render]`."""
@@ -160,22 +157,16 @@ def check(
     names, outcomes = _outcomes(scene, outcome, rng)
     if cost is not None and (motions.bad_steps < 0).any():
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
+    first = lambda one: say(f"- First verdict. {findings.slope_finding(findings.slopes(one)).text}")  # noqa: E731
     measured, price = None, 0.0  # of a slope of one step, in s
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
         with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(
-                scene,
-                motions,
-                mover,
-                rng,
-                from_start=cost is not None,
-                seconds=_MOVED * budget,
-                log=say,
-                first=lambda one: say(f"- First verdict. {findings.slope_finding(findings.slopes(one)).text}"),
+                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say, first=first
             )
-        price = mover.slope_seconds
+        price = mover.step_seconds / mover.size
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
     if mjx and (motions.bad_steps < 0).any():
@@ -265,7 +256,7 @@ import jax.numpy as jnp
 import mjxgrad as mg
 {more}
 scene = mg.load_scene({path!r}{settings}){yours}
-cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}  # yours: how far it comes, and drives
+cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}  # yours, m or rad: here how far it comes
 start = mg.initial_state(scene{_keyframe(scene)})
 task = mg.SceneTask(scene, start, cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
 """

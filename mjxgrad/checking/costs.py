@@ -29,9 +29,8 @@ def named_cost(scene: Scene, name: str) -> Cost:
     if kind not in _BUILT_IN:
         is_module = kind.endswith(".py") or importlib.util.find_spec(kind.partition(".")[0]) is not None
         if not is_module and (near := difflib.get_close_matches(kind, _BUILT_IN, 1)):
-            raise ValueError(
-                f"cost must be one of {', '.join(_BUILT_IN)}, or a function; did you mean {near[0]}:{what}?"
-            )
+            known = ", ".join(_BUILT_IN)
+            raise ValueError(f"cost must be one of {known}, or a function; did you mean {near[0]}:{what}?")
         return _function(name)
     if len(names := what.split("/")) != _BUILT_IN[kind]:
         raise ValueError(f"cost: {kind} is of {'two, as reach:hand/ball' if kind == 'reach' else 'one'}, got {what!r}")
@@ -77,9 +76,8 @@ def _told(name: str) -> Iterator[None]:
         yield
     except Exception as error:
         if isinstance(error, jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError):
-            raise ValueError(
-                f"cost {name!r} must compute with jax.numpy, got NumPy, float() or if on traced numbers"
-            ) from error
+            wanted = "must compute with jax.numpy, got NumPy, float() or if on traced numbers"
+            raise ValueError(f"cost {name!r} {wanted}") from error
         forms = "file.py:function, module:function, or of a body as height:torso"
         raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}; a cost must be {forms}") from error
 

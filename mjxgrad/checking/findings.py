@@ -126,18 +126,15 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
     is_useless = derivative == 0 or not math.isfinite(value + derivative)
     when = f"after {controls.shape[1] * motions.timestep:.2g} s of a random motion"
     remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero." * is_useless
-    return Finding(
-        "cost", f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}", is_useless
-    )
+    text = f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}"
+    return Finding("cost", text, is_useless)
 
 
 def engine_finding(scene: Scene, motions: Motions) -> Finding:
     """Compare a step by MJX, which is compiled, with C MuJoCo's, both solved to rounding, in states of the motions."""
     model = scene.to_mujoco()
-    model.opt.iterations, model.opt.ls_iterations = (
-        max(200, n) for n in (model.opt.iterations, model.opt.ls_iterations)
-    )
-    model.opt.tolerance = 1e-14
+    opt = model.opt
+    opt.iterations, opt.ls_iterations, opt.tolerance = max(200, opt.iterations), max(200, opt.ls_iterations), 1e-14
     try:
         with warnings.catch_warnings(action="ignore"):
             scene = load_scene(model, engine=next(iter(ENGINES)), keep_everything=True)

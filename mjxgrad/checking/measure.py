@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from numpy.random import Generator
 
 from mjxgrad._text import format_number
 from mjxgrad.checking.motions import (
@@ -96,7 +97,7 @@ def measure(
     scene: Scene,
     motions: Motions,
     mover: Mover,
-    rng: np.random.Generator,
+    rng: Generator,
     *,
     from_start: bool,
     seconds: int | float,
@@ -170,9 +171,7 @@ def _repeated(state: State, size: int) -> State:
     return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], size, axis=0), state)
 
 
-def _direction(
-    scene: Scene, rng: np.random.Generator, num_steps: int, speed: float, number: int
-) -> tuple[str, Direction]:
+def _direction(scene: Scene, rng: Generator, num_steps: int, speed: float, number: int) -> tuple[str, Direction]:
     """Draw a change of the start, of the controls, or a wide one of both; the line runs from −1 to 1 times it.
 
     Its length moves the first touch through several steps, so that it meets the teeth of MuJoCo's motion.
@@ -223,24 +222,13 @@ class _Probe:
         moves_start = direction.positions.any() or direction.velocities.any()
         is_moving = is_felt[-1] & (spreads[-1] > _AT_REST * spreads.max(axis=0))
         scale = np.where(is_moving, spreads[-1], np.inf)
-        jumps = jumps_along(
-            lambda x: (along("fine", x).outcomes[:, -1] - centre) / scale,
-            (-1.0, 1.0),
-            num_points=self.mover.size,
-            num_candidates=self.mover.size // 8,
-            num_refinements=_REFINEMENTS,
-            smallest=_SMALLEST_JUMP,
-        )
-        return Line(
-            pose=self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else ""),
-            varied=words,
-            plain=plain,
-            fine=shorter,
-            jumps=jumps,
-            changed=self._changed(state, controls, direction, jumps),
-            growth=np.median(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan),
-            num_diverged=sum(one.num_diverged for one in (own[0], fine)),
-        )
+        ends = lambda x: (along("fine", x).outcomes[:, -1] - centre) / scale  # noqa: E731
+        sizes = {"num_points": self.mover.size, "num_candidates": self.mover.size // 8, "num_refinements": _REFINEMENTS}
+        jumps = jumps_along(ends, (-1.0, 1.0), **sizes, smallest=_SMALLEST_JUMP)
+        pose = self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else "")
+        changed = self._changed(state, controls, direction, jumps)
+        growth = np.median(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
+        return Line(pose, words, plain, shorter, jumps, changed, growth, own[0].num_diverged + fine.num_diverged)
 
     def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
         """Return the pairs that touch only on one side of the jumps; a glancing hit jumps once per time step."""
@@ -253,7 +241,7 @@ class _Probe:
             sides.append(pairs_at(self.scene, start, controls + x * direction.controls, REFINED))
         return tuple(sorted(sides[0] ^ sides[1]))
 
-    def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: np.random.Generator) -> Noise:
+    def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: Generator) -> Noise:
         """Estimate one derivative by both orders, with noise on all controls (or the initial velocities)."""
         state, controls = self._at(motion, begin)
         size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 import scipy.interpolate
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from numpy.random import Generator
 
 from mjxgrad.batched import device
 from mjxgrad.contact import Softness
@@ -91,15 +92,13 @@ def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
     return np.where(scene.mj_model.actuator_ctrllimited & (high > low), (high - low) / 2, 1.0)
 
 
-def smooth(
-    rng: np.random.Generator, num_steps: int, num_columns: int, timestep: float
-) -> Float[np.ndarray, "steps nu"]:
+def smooth(rng: Generator, num_steps: int, num_columns: int, timestep: float) -> Float[np.ndarray, "steps nu"]:
     """Draw numbers between −1 and 1 that are piecewise linear in time between a few random knots."""
     knots = rng.uniform(-1, 1, (max(2, round(_KNOTS_PER_SECOND * num_steps * timestep) + 1), num_columns))
     return scipy.interpolate.make_interp_spline(np.linspace(0, 1, len(knots)), knots, k=1)(np.linspace(0, 1, num_steps))
 
 
-def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
+def random_motions(scene: Scene, rng: Generator) -> Motions:
     """Simulate a scene from its key frames and reference pose, under smooth random controls."""
     model, timestep = scene.to_mujoco(), float(scene.model.opt.timestep)
     num_steps = int(np.clip(round(_SECONDS / timestep), _FEWEST_STEPS, _MOST_STEPS))
@@ -112,20 +111,12 @@ def random_motions(scene: Scene, rng: np.random.Generator) -> Motions:
     names, *parts = zip(*chosen, strict=True)
     start: _States = dict(zip(("qpos", "qvel", "act"), map(np.array, parts), strict=True))
     path, bad_steps = held(run(scene, start, controls))
-    touches, touching, onsets = _touches(model, path["qpos"], path["qvel"])
+    qpos, qvel, act = path.values()
+    touches, touching, onsets = _touches(model, qpos, qvel)
     begin = max(0, int(onsets[0]) - _REPLAYED)
     window = controls[0, begin : begin + 2 * _REPLAYED]
-    return Motions(
-        **path,
-        poses=names,
-        controls=controls,
-        timestep=timestep,
-        bad_steps=bad_steps,
-        onsets=onsets,
-        touches=touches,
-        touching=touching,
-        idle=_idle(scene, {name: x[:1, begin] for name, x in path.items()}, window, half),
-    )
+    idle = _idle(scene, {name: x[:1, begin] for name, x in path.items()}, window, half)
+    return Motions(names, qpos, qvel, act, controls, timestep, bad_steps, onsets, touches, touching, idle)
 
 
 def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
@@ -277,18 +268,13 @@ class Mover:
     end: float = math.inf
 
     def __post_init__(self):
-        self._judges: dict[tuple[int, ...], Callable] = {}
+        self._judge = functools.cache(self._judge_at)
         self._num_steps, self._seconds, self._is_warm = 0, 0.0, False
 
     @property
     def step_seconds(self) -> float:
         """The mean duration of a step of a batch with its slope, so far."""
         return self._seconds / max(self._num_steps, 1)
-
-    @property
-    def slope_seconds(self) -> float:
-        """The mean duration of a step of one motion with its slope, so far."""
-        return self.step_seconds / self.size
 
     def move(
         self,
@@ -326,23 +312,14 @@ class Mover:
         growth = np.linalg.norm(course[:, list(lengths)], axis=2) / (np.linalg.norm(change) or 1.0)
         return Moved(np.asarray(outcomes), np.asarray(derivatives), growth, int(bad.sum()))
 
-    def _judge(self, lengths: tuple[int, ...]) -> Callable:
+    def _judge_at(self, lengths: tuple[int, ...]) -> Callable:
         """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""
-        if lengths in self._judges:
-            return self._judges[lengths]
         nv = self.scene.model.nv
 
         def at(length: int, bad: Array, qpos: Array, qvel: Array, act: Array, controls: Array) -> Array:
-            trajectory = Trajectory(
-                qpos[: length + 1],
-                qvel[: length + 1],
-                controls[:length],
-                observations=None,
-                final=State(qpos[length], qvel[length], act[length], jnp.zeros(()), jnp.zeros_like(qvel[0])),
-                diverged=bad,
-                first_bad_step=jnp.where(bad, 0, -1),
-                act=act[: length + 1],
-            )
+            final = State(qpos[length], qvel[length], act[length], jnp.zeros(()), jnp.zeros_like(qvel[0]))
+            qpos, qvel, act = (x[: length + 1] for x in (qpos, qvel, act))
+            trajectory = Trajectory(qpos, qvel, controls[:length], None, final, bad, jnp.where(bad, 0, -1), act=act)
             return jax.vmap(lambda one: finite_cost(one, trajectory))(self.outcomes(trajectory))
 
         def one(bad: Array, motion: tuple[Array, ...], course: Array, pushes: Array) -> tuple[Array, Array]:
@@ -351,7 +328,7 @@ class Mover:
             outcomes = lambda *motion: jnp.stack([at(length, bad, *motion) for length in lengths])  # noqa: E731
             return jax.jvp(outcomes, motion, (*parts, pushes))
 
-        return self._judges.setdefault(lengths, jax.jit(jax.vmap(one)))
+        return jax.jit(jax.vmap(one))
 
 
 def moved(

@@ -48,21 +48,7 @@ def scene_task(
     contact: Contact = Slope(),
     seed: int = 0,
 ) -> SceneTask:
-    """Return a task of a scene, with cost and start given by names.
-
-    Args:
-        scene: from `load_scene`; its resting controls become those of the key frame.
-        cost: function of a trajectory; or file.py:function, module:function; or a cost of bodies and sites at the end,
-            height:torso (minus its height, m), speed:torso (minus its mean speed along x, m/s), upright:torso (1 − cosine of
-            its tilt), reach:hand/ball (their distance, m). None is a random mix of the heaviest body's final coordinates.
-        start: a key frame; None is the reference pose, at rest.
-        horizon: number of steps; None is half a second, but 50 to 300 steps.
-        contact: how contact is stepped, see `rollout`.
-        seed: seed of the mix.
-
-    Raises:
-        ValueError: in one sentence, if there is no such file, function, body or key frame.
-    """
+    """Return a task of a scene, with cost and start given by names; arguments and errors are those of `sweep`."""
     model = scene.mj_model
     state = initial_state(scene) if start is None else initial_state(scene, keyframe=start)
     if start is not None:
@@ -261,8 +247,9 @@ def sweep(
 
     Args:
         source: an MJCF file, or another source for `load_scene`.
-        cost: function of a trajectory; or file.py:function, module:function; or at the end height:body, speed:body,
-            upright:body, reach:body/site. None is a random mix of the heaviest body's final coordinates.
+        cost: function of a trajectory; or file.py:function, module:function; or a cost of bodies and sites at the end,
+            height:torso (minus its height, m), speed:torso (minus its mean speed along x, m/s), upright:torso (1 − cosine of
+            its tilt), reach:hand/ball (their distance, m). None is a random mix of the heaviest body's final coordinates.
         stiffness: stiffnesses to sweep (1/s²), besides the file's own.
         noise: standard deviation on each control of each step, in halves of its range; without controls, on velocities.
         num_samples: rollouts per estimate.
@@ -270,7 +257,8 @@ def sweep(
         seed: seed of all random numbers.
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
         engine: who steps, see `Scene.with_engine`; by default the scene's own.
-        **task_settings: `start`, a key frame; `horizon`, the number of time steps; `contact`, `mg.Slope()` by default.
+        **task_settings: `start`, a key frame with its controls, by default the reference pose, at rest; `horizon`, a number of
+            time steps, by default half a second, but 50 to 300; `contact`, see `rollout`, by default `mg.Slope()`.
 
     Raises:
         ValueError: if there is no such file, function, body or key frame, or a number is out of range.
@@ -291,26 +279,18 @@ def sweep(
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
-    result = bias_variance(
-        knob,
-        jnp.zeros((1, 1)),
-        jax.random.key(seed),
-        softness=Softness(stiffness=swept),
-        num_samples=num_samples,
-        num_reference=num_reference,
-        reference=knob.truth if task.num_controls else None,
-        compiler_options=compiler_options(),
-        progress=None if log is None else lambda done, total: log(f"{done} of {total} stiffnesses"),
-    )
+    given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
+    given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
+    progress = None if log is None else lambda done, total: log(f"{done} of {total} stiffnesses")
+    result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=progress, **given)
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
     kinds = {"slope": "the slope of the outcome", "discrete": "that of each step"}
     kind = kinds.get(getattr(contact, "gradient", ""), f"{contact}")
+    none = "No two geoms can touch, so stiffness has no effect."
     told = [
         f"Gradient of {called} after {task.horizon} steps, by {knob}.",
-        "Swept contacts are critically damped."
-        if scene.pairs
-        else "No two geoms can touch, so stiffness has no effect.",
+        "Swept contacts are critically damped." if scene.pairs else none,
         f"Derivative: {kind}, by {engine_of(task.scene, contact).title}.",
     ]
     if isinstance(contact, Slope) and scene.pairs and swept[-1] >= shortest:
