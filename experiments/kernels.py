@@ -16,7 +16,7 @@ import mjxgrad as mg
 from experiments.problems.planar_pusher import planar_pusher
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
-from experiments.theme import FIRST, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
+from experiments.theme import FIRST, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import joined, quantity
 from experiments.workspace import Workspace
 from mjxgrad.planning import Analytic, GoalCost, optimise_trajectory
@@ -94,10 +94,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 
 def _kernel(settings: Settings, name: str) -> Kernel:
-    contact = mg.Smoothing(settings.length, kernel=name)
-    near, far = (_motion(contact, settings.length * r) for r in (_NEAR, _FAR))
-    misses = np.array([_miss(name, gap) for gap in settings.gaps])
-    return Kernel(near[0], far, _means(settings, name, near[0]), misses)
+    near, far = (_motion(mg.Smoothing(settings.length, kernel=name), settings.length * r) for r in (_NEAR, _FAR))
+    return Kernel(near[0], far, _means(settings, name, near[0]), np.array([_miss(name, gap) for gap in settings.gaps]))
 
 
 def _motion(contact: Any, heights: np.ndarray) -> np.ndarray:
@@ -141,23 +139,26 @@ def _miss(name: str, gap: float) -> float:
 
 def answer(outcome: Outcome) -> str:
     """Say whether laws are means, and from how far each finds the push."""
-    reach = {n: np.compress(k.misses <= _ARRIVED, outcome.settings.gaps) for n, k in outcome.kernels.items()}
-    told = joined(f"{max([0.0, *gaps]):g} ({KERNELS[name][0]})" for name, gaps in reach.items())
+    gaps = {n: np.compress(k.misses <= _ARRIVED, outcome.settings.gaps) for n, k in outcome.kernels.items()}
+    told = joined(f"{max([0.0, *found]):g} ({KERNELS[name][0]})" for name, found in gaps.items())
     return f"Samples {'agree' if outcome.off < 5 else 'disagree'}; pushes found from {told} m."
 
 
 def verdict(outcome: Outcome) -> str:
     """Say how near laws are to means, and what is left ten lengths away."""
     far = joined(f"{quantity(k.far[0, _TOLD[1]])} N ({KERNELS[name][0]})" for name, k in outcome.kernels.items())
-    near = f"The smoothed step's force is within {outcome.off:.1f} standard errors of the mean of MuJoCo's over the density."
-    return f"{near} Ten lengths away, where nothing touches, the ball still feels {far}."
+    near = f"A smoothed step's force is within {outcome.off:.1f} standard errors of MuJoCo's mean over the density."
+    return f"{near} Ten lengths away, where nothing touches, it is {far}."
 
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate forces and slopes near and far."""
     rows = [[KERNELS[n][0], *map(quantity, k.far[:, _TOLD].T.ravel().tolist())] for n, k in outcome.kernels.items()]
-    heads = ("kernel", "force at 1 (N)", "slope at 1 (1/s)", "force at 10 (N)", "slope at 10 (1/s)")
-    return [Table(heads, rows, "Forces, and slopes of the speed by the height, at 1 and 10 lengths.")]
+    heads = (
+        "kernel",
+        *(f"{what} at {at}" for at in ("1 length", "10 lengths") for what in ("force (N)", "slope (1/s)")),
+    )
+    return [Table(heads, rows, "Slope: of the speed after a step by the height.")]
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -175,13 +176,11 @@ def kernels(outcome: Outcome):
         near.plot(_NEAR, one.near, color=colour, label=label)
         near.errorbar(_NEAR[_SAMPLED], one.means[0], 2 * one.means[1], color=colour, fmt="o", ms=3.5, lw=1)
         far.plot(_FAR, -one.far[1], color=colour)
-        gaps = np.array(outcome.settings.gaps) / _PUSH_LENGTH
-        push.plot(gaps, 1e3 * one.misses, color=colour, marker="o")
+        push.plot(np.divide(outcome.settings.gaps, _PUSH_LENGTH), 1e3 * one.misses, color=colour, marker="o")
     near.set(title="Force on the ball (N)", xlabel="distance / length")
-    far.set(title="Slope of its speed by its height (1/s)", xlabel="distance / length", xscale="log")
-    far.set(yscale="log", ylim=(1e-9, 10))
+    far.set(title="Slope of its speed by its height (1/s)", xlabel="distance / length", ylim=(1e-9, 10))
+    far.loglog()
     push.set(title="Pushed rod from its goal (mm)", xlabel="gap at the start / length", ylim=(0, None))
-    plain(far.xaxis)
     legend_below(figure, near, 4)
     caption = (
         "Left, lines by the smoothed step, dots means of MuJoCo's force over samples of the density, at the same acceleration. "

@@ -145,11 +145,13 @@ def test_derivatives_are_central_differences(scene, name):
     assert np.abs(found).min() > 1e-3
 
 
+@pytest.mark.parametrize("name", ["gaussian", pytest.param("log_barrier", marks=pytest.mark.slow)])
 @scenes
-def test_backward_moves_as_without_and_differentiates_the_smoothed_step(scene):
+def test_backward_moves_as_without_and_differentiates_the_smoothed_step(scene, name):
     """To the last bit the one, and to that of the solve the other: two starts of one iteration."""
     model, data = _scene(**scene)
-    modes = (mg.Discrete(), mg.Smoothing(LENGTH), mg.Smoothing(LENGTH, mode="backward"))
+    smoothed = (mg.Smoothing(LENGTH, mode, name) for mode in ("forward", "backward"))
+    modes = (mg.Discrete(), *smoothed)
 
     def outcome(height, contact):
         position = jnp.array([0.0, 0.0, 0.0]).at[0].set(height)
