@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from mjxgrad.batched import device
 
@@ -103,31 +103,6 @@ def _of_leaves(function: Callable, batch: int | None) -> Callable:
         return jax.tree.map(back, result), jax.tree.map(lambda _: True, result)
 
     return batched
-
-
-class Subset:
-    """A subset of a batch, the trailing axis of arrays, that can be taken out and put back.
-
-    It holds the first chosen members in their order, then others if there is room; `is_taken` marks the chosen ones in it.
-    """
-
-    def __init__(self, is_chosen: Bool[Array, " batch"], count: int):
-        # `top_k` keeps equal entries in order.
-        _, self._index = jax.lax.top_k(is_chosen.astype(jnp.float32), count)
-        self._place = jnp.cumsum(is_chosen) - 1
-        self.is_taken = is_chosen & (self._place < count)
-
-    def take(self, whole: PyTree) -> PyTree:
-        """Return the arrays of the subset; an axis of length one stays, as all members share it."""
-        return jax.tree.map(lambda x: x if x.shape[-1] == 1 else jnp.take(x, self._index, axis=-1, mode="clip"), whole)
-
-    def put(self, whole: PyTree, part: PyTree) -> PyTree:
-        """Return the whole with the taken members replaced."""
-
-        def put(one: Array, subset: Array) -> Array:
-            return jnp.where(self.is_taken, jnp.take(subset, self._place, axis=-1, mode="clip"), one)
-
-        return jax.tree.map(put, whole, part)
 
 
 def _moved_last(leaves: Sequence[Array], is_batched: Sequence[bool], size: int) -> list[Array]:

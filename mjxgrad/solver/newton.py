@@ -353,11 +353,18 @@ def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], 
 
     The subset has `count` places, at least as many as members are left.
     """
-    subset = linear.Subset(is_left, count)
-    part = subset.take(solver)
+    index, place = jnp.flatnonzero(is_left, size=count, fill_value=0), jnp.cumsum(is_left) - 1
+
+    def take(whole: PyTree) -> PyTree:  # an axis of length one stays, as all members share it
+        return jax.tree.map(lambda x: x if x.shape[-1] == 1 else jnp.take(x, index, axis=-1, mode="clip"), whole)
+
+    def put(one: Array, own: Array) -> Array:
+        return jnp.where(is_left, jnp.take(own, place, axis=-1, mode="clip"), one)
+
+    part = take(solver)
     # Evaluated anew, which is faster than gathering it.
-    began = part.measure(*subset.take((state.point.acceleration, state.is_near, state.num_iterations)))
-    return subset.put(result, part.result(part.run(began, 0)))
+    began = part.measure(*take((state.point.acceleration, state.is_near, state.num_iterations)))
+    return jax.tree.map(put, result, part.result(part.run(began, 0)))
 
 
 class _Solver(eqx.Module):
