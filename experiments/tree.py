@@ -26,7 +26,7 @@ SMOOTHED, UNSMOOTHED, ALONE = "smoothed tree", "unsmoothed tree", "trajectory op
 ARMS = (SMOOTHED, UNSMOOTHED, ALONE)
 _APART = np.array([0.35, -0.75, -0.35, 0.75])  # rad, of fingers beside the disc
 _REACH, _STDDEV = 0.4, 0.3  # rad, of a servo's target: most change in a step, and noise of the smoothed models
-_POLISH, _HORIZON = 10, 20  # iterations after a tree; of trajectory optimisation alone twice as many, of so many steps
+_HORIZON = 20  # steps of trajectory optimisation alone
 
 
 class Sizes(SettingsTable):
@@ -51,6 +51,10 @@ class Settings(RunSettings):
     """Distance from it that counts as reached (degrees)."""
     position_tolerance: Positive = 0.03
     """The same for the place of the body (m)."""
+    max_extension: Annotated[int, Field(ge=1)] = 3
+    """Most steps of a tree towards one sample."""
+    num_iterations: Annotated[int, Field(ge=1)] = 10
+    """Iterations of trajectory optimisation after a tree; alone twice as many."""
     size: Literal["default", "quick"] = "default"
     """Which of the sizes."""
     sizes: Sizes = Sizes()
@@ -119,13 +123,13 @@ class Problem:
         """Return the changes of states from a start."""
         return np.asarray(jax.vmap(self.system.difference, (0, None))(states, start))
 
-    def tree(self, arm: str) -> Tree:
+    def tree(self, arm: str, max_extension: int) -> Tree:
         """Return the planner of an arm."""
         upper, (place, turn) = self.changes(1.0, self.near[0], 3 * self.near[1], 0.0), self.near
         lower, upper[self.turn.stop - 1] = -upper, 3 * turn + self.angle
         return Tree(
             self.system, self.goal, self.changes(np.inf, place, turn, np.inf), lower=lower, upper=upper, reach=_REACH,
-            resolution=self.changes(0.2, 0.02, 0.1, np.inf),
+            resolution=self.changes(0.2, 0.02, 0.1, np.inf), max_extension=max_extension,
             smoother=Exact() if arm == UNSMOOTHED else Sampled(None, _STDDEV, 20 + len(self.control)),
         )  # fmt: skip
 
@@ -166,29 +170,30 @@ def _block() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Search by every arm from every seed."""
     problem, attempts, count = Problem(settings), [], settings.sizes.num_seeds
-    trees = {arm: problem.tree(arm) for arm in (SMOOTHED, UNSMOOTHED)}
+    trees = {arm: problem.tree(arm, settings.max_extension) for arm in (SMOOTHED, UNSMOOTHED)}
     with workspace.stage("search", "attempts", len(ARMS) * count) as advance_to:
         for number in range(len(ARMS) * count):
             arm, seed = ARMS[number % len(ARMS)], settings.seed + number // len(ARMS)
-            compute = functools.partial(_attempt, problem, settings.sizes, trees.get(arm), arm, seed)
+            compute = functools.partial(_attempt, problem, settings, trees.get(arm), arm, seed)
             attempts.append(workspace.once(f"{arm} {seed}", compute))
             advance_to(number + 1)
     return Outcome(settings, attempts)
 
 
-def _attempt(problem: Problem, sizes: Sizes, tree: Tree | None, arm: str, seed: int) -> Attempt:
-    key, start, control = jax.random.key(seed), problem.start, problem.control
+def _attempt(problem: Problem, settings: Settings, tree: Tree | None, arm: str, seed: int) -> Attempt:
+    key, start, control, count = jax.random.key(seed), problem.start, problem.control, settings.num_iterations
     if tree is None:
         course, points, parents, seconds = np.array([np.inf]), np.zeros((1, 2)), np.array([-1]), 0.0
         noise = jax.random.normal(key, (_HORIZON, len(control)))
-        controls = problem.polished(control + 0.1 * _STDDEV * noise, key, 2 * _POLISH)
+        controls = problem.polished(control + 0.1 * _STDDEV * noise, key, 2 * count)
     else:
+        sizes = settings.sizes
         found = tree.search(start, control, key, capacity=sizes.capacity, max_seconds=sizes.max_seconds)
         course, parents, seconds = np.minimum.accumulate(found.errors), found.parents, found.seconds
         away = problem.away(found.nodes, start)
         turned, displaced = np.rad2deg(away[:, problem.turn.stop - 1]), np.linalg.norm(away[:, problem.place], axis=1)
         points = np.stack([displaced, turned], axis=1)
-        controls = problem.polished(found.controls, key, _POLISH) if found.found else found.controls
+        controls = problem.polished(found.controls, key, count) if found.found else found.controls
     states = problem.replayed(controls)
     off = problem.away(states[-1:], problem.goal)[0]
     error = float(np.max(np.abs(off) / problem.changes(np.inf, *problem.near, np.inf)))
@@ -209,7 +214,7 @@ def verdict(outcome: Outcome) -> str:
         good = [(len(one.course), one.seconds, one.angle_error) for one in outcome.of(arm, solved=True)]
         nodes, seconds, angle = np.median(good, axis=0) if good else np.zeros(3)
         searched = f" after {nodes:.0f} nodes and {seconds:.1f} s" if arm != ALONE else ""
-        told = f"{len(good)} seeds{searched} to {angle:.2g}° (medians)" if good else "no seed"
+        told = f"{len(good)} of {len(outcome.of(arm))} seeds{searched} to {angle:.2g}° (medians)" if good else "no seed"
         said.append(f"{arm.capitalize()} turns the body from {told}.")
     return " ".join(said)
 
@@ -218,7 +223,7 @@ def findings(outcome: Outcome) -> list[str]:
     """Say what counts, and how far trajectory optimisation comes."""
     off = [one.angle_error for one in outcome.of(ALONE)]
     counts = "What counts is the replay of the controls by plain C MuJoCo"
-    return [f"{counts}; trajectory optimisation alone ends {min(off):.2g} to {max(off):.3g}° from the goal."]
+    return [f"{counts}; trajectory optimisation alone ends {min(off):.0f} to {max(off):.0f}° from the goal."]
 
 
 def tables(outcome: Outcome) -> list[Table]:

@@ -38,7 +38,7 @@ def test_the_report_counts_replays_that_end_at_the_goal(tmp_path):
         SETTINGS, [attempt(SMOOTHED, 0.5), attempt(SMOOTHED, 1.1), attempt(UNSMOOTHED, 1.01), attempt(ALONE, 15.0, 1)]
     )
     assert answer(found) == "Smoothed tree 1 of 2, unsmoothed tree 0 of 1, trajectory optimisation 0 of 1."
-    assert "Smoothed tree turns the body from 1 seeds after 4 nodes and 2.0 s to 3° (medians)." in verdict(found)
+    assert "Smoothed tree turns the body from 1 of 2 seeds after 4 nodes and 2.0 s to 3° (medians)." in verdict(found)
     assert "Unsmoothed tree turns the body from no seed." in verdict(found)
     assert len(tables(found)[0].rows) == 4
     assert len(save(drawings(found), found, tmp_path)) == 1
