@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from pydantic import Field
@@ -64,6 +64,18 @@ class Case:
     duration: float  # in s
     qpos: Mapping[int, float] = field(default_factory=dict)  # start positions that differ from the model's, by index
     qvel: Mapping[int, float] = field(default_factory=dict)  # start velocities that differ from zero, by index
+
+    @property
+    def start(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]]:
+        """Positions and velocities."""
+        return filled(self.model.qpos0, self.qpos), filled(np.zeros(self.model.nv), self.qvel)
+
+
+def filled(base: Float[np.ndarray, " n"], values: Mapping[int, float]) -> Float[np.ndarray, " n"]:
+    """Return numbers with others in their place, by index."""
+    base = base.copy()
+    base[list(values)] = list(values.values())
+    return base
 
 
 def case(name: str) -> Case:
@@ -246,56 +258,51 @@ def _without_trend(
     return (flat - basis @ np.linalg.lstsq(basis, flat, rcond=None)[0]).reshape(values.shape)
 
 
+def _sample(
+    scene: mg.Scene,
+    one: Case,
+    parameters: Float[Array, " starts"],
+    rows: Int[ArrayLike, " times"],
+    has_derivative: bool = True,
+    **how: Any,
+) -> tuple[Float[Array, "starts times labels"], Float[Array, "starts times labels"]]:
+    """Give readings of rollouts, in some rows of their states, and their derivatives by the parameter, or zeros."""
+    qpos, qvel = map(jnp.asarray, one.start)
+
+    def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
+        course = mg.rollout(scene, mg.initial_state(scene, qpos.at[one.moved].add(parameter), qvel), **how)
+        return jax.vmap(one.read)(course.qpos[rows], course.qvel[rows])
+
+    def both(parameter: Float[Array, ""]) -> tuple[Array, Array]:
+        if not has_derivative:
+            return (outcome := simulate(parameter)), jnp.zeros_like(outcome)
+        return jax.jvp(simulate, (parameter,), (jnp.ones_like(parameter),))
+
+    return jax.lax.map(both, parameters, batch_size=_TOGETHER)
+
+
 @functools.lru_cache(maxsize=1)
 def _by_mjx(name: str, horizon: int) -> Callable[..., tuple[Array, Array]]:
-    """Return readings and derivatives of rollouts by MJX, compiled once for all time steps."""
+    """Return samples by MJX, compiled once for all time steps."""
     one = case(name)
     scene, controls = mg.load_scene(one.model), jnp.zeros((horizon, one.model.nu))
 
-    def sample(
-        arm: str, timestep: Array, rows: Array, qpos: Array, qvel: Array, parameters: Array
-    ) -> tuple[Array, Array]:
+    def sample(arm: str, timestep: Array, rows: Array, parameters: Array) -> tuple[Array, Array]:
         own = scene.with_model(timestep=timestep)
-
-        def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
-            start = mg.initial_state(own, qpos.at[one.moved].add(parameter), qvel)
-            course = mg.rollout(own, start, controls, contact=ARMS[arm])
-            return jax.vmap(one.read)(course.qpos[rows], course.qvel[rows])
-
-        return jax.lax.map(lambda x: jax.jvp(simulate, (x,), (jnp.ones_like(x),)), parameters, batch_size=_TOGETHER)
+        return _sample(own, one, parameters, rows, controls=controls, contact=ARMS[arm])
 
     return jax.jit(sample, static_argnums=0)
 
 
 def _by_mujoco(
-    model: mujoco.MjModel,
-    qpos: np.ndarray,
-    qvel: np.ndarray,
-    parameters: Float[np.ndarray, " starts"],
-    steps_between: int,
-    one: Case,
-    gradient: Gradient | None,
-    *,
-    by_policy: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Give readings and derivatives of rollouts by C MuJoCo, under controls or a policy that are zero; or readings alone."""
-    scene, steps = mg.load_scene(model, engine="mujoco"), _NUM_TIMES * steps_between
+    model: mujoco.MjModel, parameters: Array, rows: np.ndarray, one: Case, arm: str | None
+) -> tuple[Array, Array]:
+    """Give samples by C MuJoCo, under controls or a policy that are zero; without an arm readings alone."""
+    scene, steps = mg.load_scene(model, engine="mujoco"), int(rows[-1])
     controls = jnp.zeros((steps, model.nu))
-    acts, horizon = ((lambda _, state: controls[0]), steps) if by_policy else (controls, None)
-    every = slice(steps_between - 1, None, steps_between)
-
-    def simulate(parameter: Float[Array, ""]) -> Float[Array, "times labels"]:
-        start = mg.initial_state(scene, jnp.asarray(qpos).at[one.moved].add(parameter), jnp.asarray(qvel))
-        course = mg.rollout(scene, start, acts, horizon=horizon, contact=own_motion(gradient or "discrete"))
-        return jax.vmap(one.read)(course.qpos[1:][every], course.qvel[1:][every])
-
-    def both(parameter: Float[Array, ""]) -> tuple[Array, Array]:
-        if gradient is None:
-            return (outcome := simulate(parameter)), jnp.zeros_like(outcome)
-        return jax.jvp(simulate, (parameter,), (jnp.ones_like(parameter),))
-
-    found = jax.jit(functools.partial(jax.lax.map, both, batch_size=_TOGETHER))(jnp.asarray(parameters))
-    return np.asarray(found[0]), np.asarray(found[1])
+    how = {"controls": (lambda _, state: controls[0]), "horizon": steps} if arm == POLICY else {"controls": controls}
+    how["contact"] = own_motion(_BY_MUJOCO[arm] if arm else "discrete")
+    return jax.jit(lambda at: _sample(scene, one, at, rows, arm is not None, **how))(parameters)
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -320,8 +327,6 @@ def _steps_between(one: Case, timestep: float) -> int:
 
 def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     one = case(name)
-    qpos, qvel = one.model.qpos0.copy(), np.zeros(one.model.nv)
-    qpos[list(one.qpos)], qvel[list(one.qvel)] = list(one.qpos.values()), list(one.qvel.values())
     # Neither evenly spaced nor of one length: teeth must not fall in step with the starts.
     parameters = phases(one.interval, settings.num_phases)
     steps = _steps_between(one, timestep)
@@ -330,23 +335,19 @@ def _course(name: str, timestep: float, settings: Settings) -> xr.Dataset:
     model = copy.copy(one.model)
     model.opt.timestep = timestep
     arms = {}
+    rows, starts = steps * np.arange(1, _NUM_TIMES + 1), jnp.asarray(parameters)
     for arm in _ARMS:
         if arm in _BY_MUJOCO:
-            outcomes, derivatives = _by_mujoco(
-                model, qpos, qvel, parameters, steps, one, _BY_MUJOCO[arm], by_policy=arm == POLICY
-            )
+            found = _by_mujoco(model, starts, rows, one, arm)
         else:
-            rows = steps * jnp.arange(1, _NUM_TIMES + 1)
-            given = (arm, timestep, rows, *map(jnp.asarray, (qpos, qvel, parameters)))
-            outcomes, derivatives = map(np.asarray, _by_mjx(name, horizon)(*given))
+            found = _by_mjx(name, horizon)(arm, timestep, jnp.asarray(rows), starts)
+        outcomes, derivatives = map(np.asarray, found)
         arms[arm] = compare_to_slope(parameters, outcomes, [derivatives], (arm,))
     reference = None
     if settings.reference:
         model.opt.timestep /= settings.reference
-        count = steps * settings.reference
-        reference, _ = _by_mujoco(model, qpos, qvel, parameters, count, one, None)
-    times = timestep * steps * np.arange(1, _NUM_TIMES + 1)
-    return course(name, one.title, one.labels, timestep, times, arms, reference)
+        reference = np.asarray(_by_mujoco(model, starts, settings.reference * rows, one, None)[0])
+    return course(name, one.title, one.labels, timestep, timestep * rows, arms, reference)
 
 
 def _own_course(settings: Settings, workspace: Workspace) -> xr.Dataset:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.motion import own_task
-from experiments.sawtooth import ball
+from experiments.sawtooth import ball, filled
 from experiments.sawtooth import case as landing_case
 from experiments.work_precision.settings import Settings
 from mjxgrad.tasks import scene_path
@@ -37,7 +37,7 @@ class Case:
     @property
     def start(self) -> tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]]:
         """Positions and velocities in the middle of the uncertainty."""
-        return _filled(self.model.qpos0, self.qpos), _filled(np.zeros(self.model.nv), self.qvel)
+        return filled(self.model.qpos0, self.qpos), filled(np.zeros(self.model.nv), self.qvel)
 
     @property
     def controls(self) -> Float[np.ndarray, " nu"]:
@@ -45,7 +45,7 @@ class Case:
 
     @property
     def weights(self) -> Float[np.ndarray, " nq"]:
-        return _filled(np.zeros(self.model.nq), self.outcome)
+        return filled(np.zeros(self.model.nq), self.outcome)
 
     @property
     def directions(self) -> Float[np.ndarray, "2 nv"]:
@@ -55,12 +55,6 @@ class Case:
     @property
     def timestep(self) -> float:
         return self.model.opt.timestep
-
-
-def _filled(base: np.ndarray, values: Mapping[int, float]) -> np.ndarray:
-    filled = base.copy()
-    filled[list(values)] = list(values.values())
-    return filled
 
 
 def case(name: str) -> Case:

@@ -5,8 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.billiards import MethodSettings, Outcome, Run, Settings, answer, hard_cost, hard_optimum, verdict
-from experiments.problems.billiards import billiards
+from experiments.billiards import (
+    MethodSettings,
+    Outcome,
+    Run,
+    Settings,
+    answer,
+    billiards,
+    hard_cost,
+    hard_optimum,
+    verdict,
+)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from experiments.problems.rolling_pin import DENT, DEPTH, rolling_pin
-from experiments.rolling_pin import Descent, Outcome, Settings, answer, tables, verdict
+from experiments.rolling_pin import DENT, DEPTH, Descent, Outcome, Settings, answer, rolling_pin, tables, verdict
 
 HORIZON = 40
 
