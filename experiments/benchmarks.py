@@ -1,6 +1,7 @@
 """How fast, against what, and in how much memory: `make bench`, `make costs`, `make throughput`.
 
-Each in one process on the same work, compilation apart. Memory is what XLA sets aside for a program besides its arguments.
+Each in one process on the same work, compilation apart; all take turns, so that load meets all alike. Memory is
+what XLA sets aside for a program besides its arguments.
 
 `bench`: steps and gradients on the same scene, batch and number of steps; each row is the median of several runs, with the range.
 
@@ -12,8 +13,7 @@ Each in one process on the same work, compilation apart. Memory is what XLA sets
 
 With `--per-core` every core is a device of its own, and `mg.over_devices` splits each row of JAX's, MJX's included.
 
-`costs`: onset, slope at MuJoCo's motion and smoothing over the plain step and its gradient; all take turns, so that load meets
-all alike.
+`costs`: onset, slope at MuJoCo's motion and smoothing over the plain step and its gradient.
 
 `throughput`: ten stiffness values × 1000 samples × three estimators on `ball_wall`, once with the softness as an argument of one
 compiled program and once as ten programs, as ten runs of a script would make them. Nothing is read from a compilation cache.
@@ -25,7 +25,7 @@ import importlib.util
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -71,6 +71,12 @@ _COSTS = {
     "rollout": ("", "onset", "smoothed"),
     "value_and_grad": ("", "onset", "slope", "smoothed", "smoothed backward"),
     "jvp": ("", "onset", "slope"),
+}
+
+_TRANSFORMS: dict[str, Callable[[Callable], Callable]] = {
+    "rollout": lambda one: one,
+    "value_and_grad": jax.value_and_grad,
+    "jvp": lambda one: lambda qvel: jax.jvp(one, (qvel,), (jnp.ones_like(qvel),)),
 }
 
 # Of `throughput`.
@@ -146,11 +152,7 @@ def bench(*, options: Bench | None = None) -> None:
     announce(f"{options.steps} steps, float32, tolerance {_TOLERANCE}, median of {options.runs} runs [range]")
     for name in options.scene:
         for batch in options.batch:
-            print(f"\n{name}, batch {batch}")
-            base = None
-            for row in _rows(name, batch, options):
-                base = base or row
-                _print(row, base, batch * options.steps)
+            _print(f"{name}, batch {batch}", _rows(name, batch, options), batch * options.steps)
 
 
 def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
@@ -173,8 +175,7 @@ def _rows(name: str, batch: int, options: Bench) -> Iterator[Row]:
     cases["mg value_and_grad, all kept"] = jax.value_and_grad(functools.partial(ours, checkpoint=False))
     if options.forward:
         cases = {case: function for case, function in cases.items() if "grad" not in case}
-    for case, function in cases.items():
-        yield _time(case, mg.over_devices(function), states, options.runs)
+    yield from _in_turns({case: mg.over_devices(one) for case, one in cases.items()}, options.runs, states)
     if is_cpu and options.runs:
         yield _native(mj_model, states, options)
     if options.runs and importlib.util.find_spec("warp"):
@@ -208,10 +209,14 @@ def _mjx_outcome(scene: mg.Scene, state: tuple[jax.Array, jax.Array], steps: int
     return jnp.sum(final[0] ** 2) + jnp.sum(final[1] ** 2)
 
 
-def _time(name: str, function: Callable, states: Any, runs: int) -> Row:
-    program, compilation, memory = _compile(function, states)
-    # The first run, which is left out, finds nothing in the caches.
-    return Row(name, [_seconds(program, states) for _ in range(runs + 1 if runs else 0)][1:], compilation, memory)
+def _in_turns(cases: dict[str, Callable], runs: int, *given: Any) -> list[Row]:
+    """Compile all, and run them in turns, of which the first finds nothing in caches and is left out."""
+    compiled = {case: _compile(function, *given) for case, function in cases.items()}
+    turns = [
+        {case: _seconds(program, *given) for case, (program, *_) in compiled.items()}
+        for _ in range(runs + 1 if runs else 0)
+    ]
+    return [Row(case, [turn[case] for turn in turns[1:]], *rest) for case, (_, *rest) in compiled.items()]
 
 
 def _warp(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], options: Bench) -> Row:
@@ -261,15 +266,20 @@ def _native(mj_model: mujoco.MjModel, states: tuple[jax.Array, jax.Array], optio
     return Row(f"C MuJoCo, {threads} threads", seconds[1:], 0.0, float("nan"))
 
 
-def _print(row: Row, base: Row, steps: int) -> None:
-    span = f"[{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]" if row.runs else ""
-    memory = "" if np.isnan(row.memory) else f"{row.memory / 1e6:9.1f} MB"
-    print(
-        f"  {row.name:32s} {row.median * 1e3:9.1f} ms {span}"
-        f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / base.median:6.2f} of mjx.step"
-        f"  compile {row.compilation:5.1f} s {memory}",
-        flush=True,
-    )
+def _print(title: str, rows: Iterable[Row], steps: int) -> None:
+    """Print rows as they come, each beside the first."""
+    print(f"\n{title}")
+    base = None
+    for row in rows:
+        base = base or row
+        span = f"[{min(row.runs) * 1e3:.1f}, {max(row.runs) * 1e3:.1f}]" if row.runs else ""
+        memory = "" if np.isnan(row.memory) else f"{row.memory / 1e6:9.1f} MB"
+        print(
+            f"  {row.name:34s} {row.median * 1e3:9.1f} ms {span}"
+            f"  {row.median / steps * 1e6:8.3f} µs/step  × {row.median / base.median:6.2f} of {base.name}"
+            f"  compile {row.compilation:5.1f} s {memory}",
+            flush=True,
+        )
 
 
 def costs(*, batch: int = 256, repeats: int = 7, only: str = "") -> None:
@@ -284,36 +294,19 @@ def costs(*, batch: int = 256, repeats: int = 7, only: str = "") -> None:
     announce(f"batch {batch}, {_NUM_STEPS} steps")
     for name, (place, height) in _STARTS.items():
         scene = mg.load_scene(_SCENES[name])
-        _cost(name, scene, scene.data.qpos.at[place].add(height), batch, repeats, only)
+        qpos = scene.data.qpos.at[place].add(height)
+        qvel = 0.3 * jax.random.normal(jax.random.key(0), (batch, scene.model.nv))
 
+        def cost(qvel: jax.Array, scene: mg.Scene = scene, qpos: jax.Array = qpos, **settings: Any) -> jax.Array:
+            state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
+            return jnp.sum(mg.rollout(scene, state, horizon=_NUM_STEPS, **settings).qpos[-1] ** 2)
 
-def _cost(name: str, scene: mg.Scene, qpos: jax.Array, batch: int, repeats: int, only: str) -> None:
-    qvel = 0.3 * jax.random.normal(jax.random.key(0), (batch, scene.model.nv))
-
-    def cost(qvel, **settings):
-        state = mg.initial_state(scene, qpos=qpos, qvel=qvel)
-        return jnp.sum(mg.rollout(scene, state, horizon=_NUM_STEPS, **settings).qpos[-1] ** 2)
-
-    transforms = {
-        "rollout": lambda one: one,
-        "value_and_grad": jax.value_and_grad,
-        "jvp": lambda one: lambda qvel: jax.jvp(one, (qvel,), (jnp.ones_like(qvel),)),
-    }
-    programs = {
-        f"{what}, {way}" if way else what: jax.jit(jax.vmap(transforms[what](functools.partial(cost, **_WAYS[way]()))))
-        for what, ways in _COSTS.items()
-        for way in ways
-        if not way or only in f"{what}, {way}"
-    }
-    turns = [{case: _seconds(program, qvel) for case, program in programs.items()} for _ in range(repeats + 1)]
-    seconds = {case: [turn[case] for turn in turns[1:]] for case in programs}
-    for case, times in seconds.items():
-        base = float(np.median(seconds[case.split(",")[0]]))
-        low, middle, high = (1e3 * float(q) for q in np.quantile(times, [0, 0.5, 1]))
-        print(
-            f"{name:14} {case:34} {middle:8.1f} ms ({low:.1f} to {high:.1f})  ratio {middle / 1e3 / base:.2f}",
-            flush=True,
-        )
+        for what, ways in _COSTS.items():
+            # The plain one comes first, beside which the others are printed.
+            cases = {f"{what}, {way}" if way else what: functools.partial(cost, **_WAYS[way]()) for way in ways}
+            chosen = {case: one for case, one in cases.items() if case == what or only in case}
+            programs = {case: jax.vmap(_TRANSFORMS[what](one)) for case, one in chosen.items()}
+            _print(f"{name}, batch {batch}, {what}", _in_turns(programs, repeats, qvel), batch * _NUM_STEPS)
 
 
 def engines(
@@ -348,15 +341,14 @@ def engines(
                 by = scene.with_engine(engine)
                 return jnp.sum(mg.rollout(by, mg.initial_state(by, qvel=speeds), controls, contact=mg.Slope()).qpos[-1])
 
-            for engine in ("mujoco", "mjx"):
-                program = jax.jit(jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1))))
-                first, *runs = [_seconds(program, speeds, controls) for _ in range(repeats + 1)]
-                print(
-                    f"{name:12} {size:4} {engine:8} first {first:7.2f} s, then {statistics.median(runs):8.3f} s",
-                    flush=True,
-                )
+            programs: dict[str, Callable] = {
+                engine: jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1)))
+                for engine in ("mujoco", "mjx")
+            }
             took = _by_hand(loaded.mj_model, np.asarray(speeds, float), np.asarray(controls, float))
-            print(f"{name:12} {size:4} mjd_transitionFD in a Python loop {took:8.3f} s", flush=True)
+            by_hand = Row("mjd_transitionFD in a Python loop", [took], 0.0, float("nan"))
+            rows = [*_in_turns(programs, repeats, speeds, controls), by_hand]
+            _print(f"{name}, batch {size}", rows, size * steps)
 
 
 def _by_hand(model: mujoco.MjModel, speeds: np.ndarray, controls: np.ndarray) -> float:
