@@ -90,13 +90,23 @@ def write_toml(path: Path, table: Mapping[str, Any], header: str) -> None:
 
 
 def _toml_lines(table: Mapping[str, Any], prefix: str = "") -> list[str]:
-    # JSON's strings, numbers and arrays are TOML's too, and so are its true and false.
     plain = {key: value for key, value in table.items() if value is not None and not isinstance(value, Mapping)}
-    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in plain.items()]
+    lines = [f"{key} = {_toml(value)}" for key, value in plain.items()]
     for key, value in table.items():
         if isinstance(value, Mapping):
             lines += ["", f"[{prefix}{key}]", *_toml_lines(value, f"{prefix}{key}.")]
     return lines
+
+
+def _toml(value: Any) -> str:
+    """Write a value as TOML, each of several tables on a line of its own."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {_toml(one)}' for key, one in value.items() if one is not None)} }}"
+    if isinstance(value, list):
+        lines, has_tables = [_toml(one) for one in value], any(isinstance(one, Mapping) for one in value)
+        return "[\n    " + ",\n    ".join(lines) + ",\n]" if has_tables else f"[{', '.join(lines)}]"
+    # JSON's strings and numbers are TOML's too, and so are its true and false.
+    return json.dumps(value, ensure_ascii=False)
 
 
 def keeping(folder: Path, fingerprint: str) -> Path:

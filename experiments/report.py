@@ -56,17 +56,15 @@ class Report:
     headline: dict[str, str] = field(default_factory=dict)
 
 
-def page(report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict]) -> str:
-    """Write a report as one HTML page that needs nothing beside it; `about` are headed lists of settings and circumstances."""
+def page(
+    report: Report, folder: Path, *, name: str, question: str, expected: str, about: dict[str, dict], config: str = ""
+) -> str:
+    """Write a report as one HTML page that needs nothing beside it; `about` are headed lists, `config` the resolved settings."""
     figures = [
         Block(lead=f"Figure {i}. {one.title}.", caption=one.caption, drawings=[(folder / one.file).read_text("utf-8")])
         for i, one in enumerate(report.figures, start=1)
     ]
-    rows = [
-        (heading, key, "\n".join(map(str, value if isinstance(value, list) else [value])))
-        for heading, entries in about.items()
-        for key, value in entries.items()
-    ]
+    rows = [(heading, key, str(value)) for heading, entries in about.items() for key, value in entries.items()]
     video = Block(lead="No video.", text=report.video_caption)
     if report.video is not None:
         video = Block(lead="Video.", video=(folder / report.video).read_bytes(), caption=report.video_caption)
@@ -80,7 +78,7 @@ def page(report: Report, folder: Path, *, name: str, question: str, expected: st
         *map(_table, filter(None, [report.summary])),
         *figures[1:],
         *map(_table, report.tables),
-        Block(look="settings", folded="Settings, time and versions", table=Table((), rows)),
+        Block(look="settings", folded="Settings, time and versions", table=Table((), rows), code=config),
     ]
     return pages.page(report.answer, f"{name}: {question}", blocks)
 

@@ -15,9 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel
-
-from experiments.config import ExperimentError, Run, flatten, load_runs, part
+from experiments.config import ExperimentError, Run, load_runs, part
 from experiments.output import building, keeping, recover, write_csv, write_text, write_toml, writing
 from experiments.parallel import num_cores
 from experiments.words import joined, merged
@@ -176,15 +174,15 @@ def _write(run: Run, report: "Report", folder: Path, facts: dict[str, Any]) -> N
         "video": report.video,
     }
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
-    text = page(report, folder, name=name, question=run.question, expected=run.expected, about=_about(run, facts))
+    told = {"question": run.question, "expected": run.expected, "about": _about(facts)}
+    text = page(report, folder, name=name, config=(folder / "config.toml").read_text(encoding="utf-8"), **told)
     (folder / "report.html").write_text(text, encoding="utf-8")
 
 
-def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _about(facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
     commit = (facts["commit"] or "no repository")[:12] + (" with uncommitted changes" if facts["dirty"] else "")
     device = facts["device"]
     return {
-        "Settings": _shown(run.settings),
         "Time": {name: f"{seconds:.1f} s" for name, seconds in facts["seconds"].items()},
         "Made with": {
             "command": facts["command"],
@@ -194,32 +192,6 @@ def _about(run: Run, facts: dict[str, Any]) -> dict[str, dict[str, Any]]:
             **facts["versions"],
         },
     }
-
-
-def _shown(settings: BaseModel) -> dict[str, Any]:
-    """Give settings by dotted key; of several tables each is a line."""
-    dumped, shown = settings.model_dump(mode="json"), {}
-    for key, value in settings:
-        if isinstance(value, tuple) and value and isinstance(value[0], BaseModel):
-            shown[key] = [_line(one) for one in value]
-        else:
-            shown |= {name: _listed(one) for name, one in flatten({key: dumped[key]}).items()}
-    return shown
-
-
-def _line(table: BaseModel) -> str:
-    """Write a table in a line: its name in the report, and what is not as it comes."""
-    given = table.model_dump(mode="json", exclude_defaults=True)
-    label = getattr(table, "label", None)
-    rest = ", ".join(
-        f"{key} = {_listed(one)}" for key, one in given.items() if not label or key not in ("name", "label")
-    )
-    return ": ".join(filter(None, [label, rest]))
-
-
-def _listed(value: Any) -> str:
-    values = value if isinstance(value, list) else [value]
-    return ", ".join(f"{one:.10g}" if isinstance(one, float) else str(one) for one in values)
 
 
 def _previous(folder: Path) -> dict[str, Any]:

@@ -80,11 +80,9 @@ def report(tmp_path):
         video_caption="It moves.",
         warnings=["hopper: the time step is too long."],
     )
-    about = {
-        "Settings": {"a_key_that_is_longer_than_most": ["one", "two = " + "9" * 80]},
-        "Made with": {"command": "x" * 90},
-    }
-    return page(made, tmp_path, name="made up", question="Does it hold on a telephone?", expected="yes", about=about)
+    about, config = {"Made with": {"command": "x" * 90}}, "a_key_that_is_longer_than_most = " + "9" * 80
+    told = {"question": "Does it hold on a telephone?", "expected": "yes", "about": about, "config": config}
+    return page(made, tmp_path, name="made up", **told)
 
 
 def test_a_report_fits_a_telephone_can_be_read_there_runs_nothing_and_fetches_nothing(report, tmp_path):
