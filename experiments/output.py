@@ -29,7 +29,6 @@ def building(folder: Path) -> Iterator[Path]:
         try:
             yield partial
             with writing(folder):
-                _sync(partial)
                 _replace(folder, partial, _previous(folder))
         finally:
             shutil.rmtree(partial, ignore_errors=True)
@@ -170,14 +169,6 @@ def _previous(folder: Path) -> Path:
 
 def _beside(folder: Path, pattern: str) -> list[Path]:
     return list(folder.parent.glob(f".{glob.escape(folder.name)}.{pattern}"))
-
-
-def _sync(folder: Path) -> None:
-    """Have all files on the disk before their folder gets its name, or a loss of power could leave empty ones."""
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
 
 
 def _replace(folder: Path, complete: Path, previous: Path) -> None:

@@ -63,9 +63,7 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
     own = (Path(str(settings.get(key)).rpartition(":")[0 if key == "cost" else 2]) for key in ("scene", "cost"))
     fingerprint = _fingerprint([settings, run.question, run.expected, [p.read_text() for p in own if p.is_file()]])
     previous = _previous(folder)
-    # A report that lacks its video is made again once there is an OpenGL to draw it with.
-    is_unchanged = previous.get("fingerprint") == fingerprint
-    if is_unchanged and not force and not (previous.get("lacks_video") and _can_draw()):
+    if previous.get("fingerprint") == fingerprint and not force:
         print(f"unchanged: {folder / 'report.html'} (same settings and code; --force runs it again)")
         return
     with building(folder) as partial:
@@ -82,7 +80,6 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
             "dirty": is_dirty,
             "versions": _versions(),
             "device": _device(),
-            "lacks_video": report.video is None and bool(report.video_caption),
             "seconds": {
                 **workspace.seconds,
                 "total": time.perf_counter() - started + workspace.kept_seconds,
@@ -94,7 +91,7 @@ def _run_one(run: Run, folder: Path, command: str, force: bool) -> None:
         with writing(folder):
             _write(run, report, partial, facts)
     print(f"{report.answer}\n{report.verdict}\n{folder / 'report.html'}")
-    if facts["lacks_video"]:
+    if report.video is None and report.video_caption:
         print(f"no video: {report.video_caption}", file=sys.stderr)
 
 
@@ -123,12 +120,6 @@ def _of_sweep(run: Run, folders: list[Path]) -> dict[str, Any]:
     told = together or (answers[0] if len(answers) == 1 else f"{len(answers)} answers in {len(folders)} runs.")
     pictures = {name: (one := summaries[0][name]) and f"{folders[0].name}/{one}" for name in ("figure", "video")}
     return {"name": run.name, "question": run.question, "answer": told, **pictures}
-
-
-def _can_draw() -> bool:
-    from experiments.video import can_draw
-
-    return can_draw()
 
 
 def _call(run: Run, workspace: Workspace) -> "Report":

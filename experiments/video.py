@@ -48,15 +48,6 @@ def film(
     return FILE, caption
 
 
-def can_draw() -> bool:
-    """Say whether there is an OpenGL that renders without a display."""
-    try:
-        frames(mujoco.MjModel.from_xml_string("<mujoco/>"), np.zeros((1, 0)), height=8, width=8)
-    except RenderingUnavailableError:
-        return False
-    return True
-
-
 def shown_speed(speed: float) -> str:
     """Name the speed of a video."""
     return "at real speed" if speed == 1 else f"at {speed:g} of real speed"

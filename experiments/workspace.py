@@ -1,7 +1,6 @@
 """What a running experiment sees of its output folder, its clock and its terminal."""
 
 import contextlib
-import os
 import pickle
 import re
 import sys
@@ -57,10 +56,7 @@ class Workspace:
         content = pickle.dumps((found, time.perf_counter() - started, self.told[before:]))
         with writing(self.folder):
             partial = path.with_suffix(".partial")
-            with partial.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            partial.write_bytes(content)
             partial.replace(path)
         return found
 

@@ -15,7 +15,7 @@ import pytest
 
 import experiments
 import mjxgrad as mg
-from experiments import config, runner, video
+from experiments import config, runner
 from experiments.__main__ import main
 from experiments.bias_variance import measure
 from experiments.report import Report
@@ -162,15 +162,6 @@ def test_a_traceback_is_shown_of_mistakes_in_the_program_and_where_it_is_asked_f
     _raise(monkeypatch, error)
     with pytest.raises(type(error)):
         run(copied / "steep.toml", copied / "runs", "--force", *debug)
-
-
-@pytest.mark.parametrize(("can_draw", "status"), [(False, 0), (True, 2)])
-def test_a_report_that_lacks_its_video_is_made_again_once_it_can_be_drawn(copied, monkeypatch, can_draw, status):
-    facts = copied / "runs" / "steep" / "environment.json"
-    facts.write_text(facts.read_text().replace('"lacks_video": false', '"lacks_video": true'))
-    monkeypatch.setattr(video, "can_draw", lambda: can_draw)
-    _raise(monkeypatch, ValueError("reached"))
-    assert run(copied / "steep.toml", copied / "runs") == status
 
 
 def test_the_terminal_says_why_there_is_no_video(copied, monkeypatch, capsys):
