@@ -160,9 +160,9 @@ def _problems(settings: Settings) -> list[Callable[[], _Problem]]:
 
 def _closed_form(settings: Settings, name: str, at: float, dim: int) -> _Problem:
     kinds = {
-        "heaviside": textbook.heaviside,
-        "soft_heaviside": lambda: textbook.soft_heaviside(0.01),
-        "quadratic_sine": lambda: textbook.quadratic_sine(0.1, 40.0),
+        "heaviside": textbook.Heaviside,
+        "soft_heaviside": lambda: textbook.SoftHeaviside(0.01),
+        "quadratic_sine": lambda: textbook.QuadraticSine(0.1, 40.0),
     }
     one = kinds[name]()
     objective = mg.parameter_noise(lambda x: jax.vmap(one)(x[:, None]).sum(), 0.1, dim)

@@ -138,10 +138,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 def _problem(settings: Settings, stiffness: float | None) -> Textbook:
     if stiffness is None:
-        return textbook.heaviside()
+        return textbook.Heaviside()
     if settings.problem == "soft_heaviside":
-        return textbook.soft_heaviside(1 / stiffness)
-    return textbook.quadratic_sine(settings.amplitude, stiffness)
+        return textbook.SoftHeaviside(1 / stiffness)
+    return textbook.QuadraticSine(settings.amplitude, stiffness)
 
 
 def _exact_error(one: MethodSettings, settings: Settings, stiffness: float | None, rollouts: int) -> float:

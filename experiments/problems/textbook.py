@@ -23,13 +23,16 @@ from jax.scipy.stats import norm
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import known
 from mjxgrad.objective import ParameterNoise, parameter_noise
 
 # Beyond nine standard deviations a Gaussian is below 1e-17. Pieces of at most one standard deviation with 32 nodes are
 # exact to rounding for all costs here (the square of a sine of three periods per standard deviation included).
 _EDGES = np.arange(-9.0, 10.0)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+
+
+def _number(value: ArrayLike) -> Float[Array, ""]:
+    return jnp.asarray(value, float)
 
 
 class Textbook(eqx.Module):
@@ -103,26 +106,12 @@ class Textbook(eqx.Module):
         return (weights.ravel() * function(jnp.asarray(point) + stddev * z.ravel(), z.ravel())).sum()
 
 
-def number(value: ArrayLike) -> Float[Array, ""]:
-    """Return a number as an array of floating point."""
-    return jnp.asarray(value, jnp.result_type(value, float))
-
-
-def positive(value: ArrayLike, name: str) -> Float[Array, ""]:
-    """Return a number as an array of floating point, refusing one that is not positive."""
-    array = number(value)
-    values = known(array)  # None in a sweep
-    if values is not None and not (values > 0).all():
-        raise ValueError(f"{name} must be positive, got {value}")
-    return array
-
-
 # Intervals shorter than this, in standard deviations, have their probability by series: a difference would cancel.
 _SHORT = 0.02
 
 
 class Heaviside(Textbook):
-    """See `heaviside`."""
+    r"""The step, 1 from zero on: $F' = \varphi(\theta/\sigma)/\sigma$, and no derivative that sees it."""
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
         return jnp.where(x[0] >= 0, jnp.ones_like(x[0]), 0)
@@ -136,9 +125,16 @@ class Heaviside(Textbook):
 
 
 class SoftHeaviside(Textbook):
-    """See `soft_heaviside`."""
+    r"""The ramp from −1 to 1 about zero, a step that has been softened.
 
-    width: Float[Array, ""]
+    With $p$ the chance to fall on the slope, $F' = 2p/\nu$, and a first-order sample is $2/\nu$ with probability $p$,
+    else 0: unbiased, with variance $(2/\nu)^2 p(1 - p)$, which grows as $1/\nu$.
+
+    Attributes:
+        width: $\nu > 0$ of the slope; $1/\nu$ is the stiffness.
+    """
+
+    width: Float[Array, ""] = eqx.field(converter=_number)
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
         return jnp.clip(2 * x[0] / self.width, -1, 1)
@@ -151,26 +147,6 @@ class SoftHeaviside(Textbook):
         return 2 * _probability(-jnp.asarray(point) / stddev, self.width / stddev) / self.width
 
 
-def heaviside() -> Heaviside:
-    r"""Return the step, 1 from zero on: $F' = \varphi(\theta/\sigma)/\sigma$, and no derivative that sees it."""
-    return Heaviside()
-
-
-def soft_heaviside(width: ArrayLike) -> SoftHeaviside:
-    r"""Return the ramp from −1 to 1 about zero, a step that has been softened.
-
-    With $p$ the chance to fall on the slope, $F' = 2p/\nu$, and a first-order sample is $2/\nu$ with probability $p$,
-    else 0: unbiased, with variance $(2/\nu)^2 p(1 - p)$, which grows as $1/\nu$.
-
-    Args:
-        width: $\nu > 0$ of the slope; $1/\nu$ is the stiffness.
-
-    Raises:
-        ValueError: if `width` is not positive.
-    """
-    return SoftHeaviside(positive(width, "width"))
-
-
 def _probability(middle: Float[Array, ""], length: Float[Array, ""]) -> Float[Array, ""]:
     """Return the chance of a standard normal variable to lie in an interval, to many digits."""
     series = length * norm.pdf(middle) * (1 + (middle**2 - 1) * length**2 / 24)
@@ -181,10 +157,18 @@ def _probability(middle: Float[Array, ""], length: Float[Array, ""]) -> Float[Ar
 
 
 class QuadraticSine(Textbook):
-    """See `quadratic_sine`."""
+    r"""The cost $x^2 + m \sin\omega x$: smooth, with a ripple whose slope $m\omega$ may be of any size.
 
-    amplitude: Float[Array, ""]
-    frequency: Float[Array, ""]
+    $F' = 2\theta + m\omega e^{-\omega^2\sigma^2/2}\cos\omega\theta$: the noise wipes the ripple out, while the
+    variance of first order keeps $m^2\omega^2/2$.
+
+    Attributes:
+        amplitude: $m$.
+        frequency: $\omega$, in rad per unit of the parameter.
+    """
+
+    amplitude: Float[Array, ""] = eqx.field(converter=_number)
+    frequency: Float[Array, ""] = eqx.field(converter=_number)
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
         return x[0] ** 2 + self.amplitude * jnp.sin(self.frequency * x[0])
@@ -197,16 +181,3 @@ class QuadraticSine(Textbook):
         # Of the ripple the noise leaves a share.
         slope = self.amplitude * self.frequency * jnp.exp(-((self.frequency * stddev) ** 2) / 2)
         return 2 * jnp.asarray(point) + slope * jnp.cos(self.frequency * point)
-
-
-def quadratic_sine(amplitude: ArrayLike, frequency: ArrayLike) -> QuadraticSine:
-    r"""Return $x^2 + m \sin\omega x$: smooth, with a ripple whose slope $m\omega$ may be of any size.
-
-    $F' = 2\theta + m\omega e^{-\omega^2\sigma^2/2}\cos\omega\theta$: the noise wipes the ripple out, while the
-    variance of first order keeps $m^2\omega^2/2$.
-
-    Args:
-        amplitude: $m$.
-        frequency: $\omega$, in rad per unit of the parameter.
-    """
-    return QuadraticSine(number(amplitude), number(frequency))

@@ -16,9 +16,9 @@ from mjxgrad.estimators import zeroth_order
 STDDEV, POINT, BASELINE = 0.1, 0.03, 0.2
 # The functions by themselves, with their kinks and jumps, not taken from the code on trial.
 PROBLEMS = {
-    "heaviside": (textbook.heaviside(), lambda x: float(x >= 0), [0.0], POINT),
-    "soft_heaviside": (textbook.soft_heaviside(0.06), lambda x: np.clip(2 * x / 0.06, -1, 1), [-0.03, 0.03], POINT),
-    "quadratic_sine": (textbook.quadratic_sine(0.1, 20.0), lambda x: x * x + 0.1 * np.sin(20 * x), [], 0.3),
+    "heaviside": (textbook.Heaviside(), lambda x: float(x >= 0), [0.0], POINT),
+    "soft_heaviside": (textbook.SoftHeaviside(0.06), lambda x: np.clip(2 * x / 0.06, -1, 1), [-0.03, 0.03], POINT),
+    "quadratic_sine": (textbook.QuadraticSine(0.1, 20.0), lambda x: x * x + 0.1 * np.sin(20 * x), [], 0.3),
 }
 
 
@@ -87,14 +87,14 @@ def test_the_zeroth_order_variance_is_that_of_cost_less_baseline_times_score(cas
 def test_a_sweep_of_widths_is_one_vmap_and_keeps_its_digits_at_any_width():
     """A ramp of width ν is a step of height 2 but for terms of order (ν/σ)²/24 · |z² − 1|."""
     widths = jnp.array([1e-3, 1e-6, 1e-9, 1e-12])
-    sweep = jax.vmap(lambda width: textbook.soft_heaviside(width).gradient(POINT, STDDEV))(widths)
+    sweep = jax.vmap(lambda width: textbook.SoftHeaviside(width).gradient(POINT, STDDEV))(widths)
     np.testing.assert_allclose(sweep, 2 * norm.pdf(POINT / STDDEV) / STDDEV, rtol=5e-6)
     np.testing.assert_allclose(sweep[1:], 2 * norm.pdf(POINT / STDDEV) / STDDEV, rtol=1e-11)
 
 
 def test_the_leave_one_out_variance_is_that_of_many_short_estimates():
     """N = 3, where the terms in 1/(N(N − 1)) are a third of the whole."""
-    problem, repeats = textbook.soft_heaviside(0.06), 40_000
+    problem, repeats = textbook.SoftHeaviside(0.06), 40_000
     keys = jax.random.split(jax.random.key(0), repeats)
 
     @eqx.filter_jit
