@@ -47,6 +47,13 @@ class Settings(RunSettings):
     """How much is measured."""
     sizes: Sizes
     """The numbers that go with the size: those of the file's table of that name."""
+    scenes: dict[SceneName, tuple[PartName, ...]] = {}
+    """Scenes in place of the size's, with what MJX is given back in each."""
+
+    @property
+    def chosen(self) -> dict[SceneName, tuple[PartName, ...]]:
+        """The scenes to measure."""
+        return self.scenes or self.sizes.scenes
 
 
 @dataclass(frozen=True)
@@ -95,8 +102,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     costs, had_cache = [], jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)  # compilation is measured, too
     try:
-        with workspace.stage("scenes", "scenes", len(settings.sizes.scenes)) as advance_to:
-            for k, name in enumerate(settings.sizes.scenes, start=1):
+        with workspace.stage("scenes", "scenes", len(settings.chosen)) as advance_to:
+            for k, name in enumerate(settings.chosen, start=1):
                 costs += workspace.once(name, functools.partial(of_scene, name, settings))
                 advance_to(k)
     finally:
@@ -107,7 +114,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 def of_scene(name: SceneName, settings: Settings) -> list[Cost]:
     """Measure one scene by both engines."""
     sizes, costs = settings.sizes, []
-    by: dict[EngineName, tuple] = {"mjx": (sizes.scenes[name], sizes.batch), "mujoco": (PARTS, sizes.few)}
+    by: dict[EngineName, tuple] = {"mjx": (settings.chosen[name], sizes.batch), "mujoco": (PARTS, sizes.few)}
     for engine, (chosen, count) in by.items():
         keys = [key for key in chosen if left_out.is_left_out(key, name, engine)]
         # Room is what `load_scene` keeps, unless it is told otherwise.
@@ -163,14 +170,17 @@ def verdict(outcome: Outcome) -> str:
     """Say what all parts cost together, and which cost nothing."""
     told, single = [], _single(outcome)
     for engine, part, title in (("mjx", "all", "MJX"), ("mujoco", "all", "C MuJoCo"), ("mjx", "mjx.step", "mjx.step")):
-        for work in ("forward", "gradient"):
+        spans = []
+        for work, word in (("forward", "a motion"), ("gradient", "a gradient")):
             factors = [c.time[1] for c in outcome.costs if (c.part, c.engine, c.work) == (part, engine, work)]
-            told += [f"{title}, {work}, {min(factors):.3g}× to {max(factors):.3g}×"] if factors else []
+            ends = dict.fromkeys(f"{end(factors):.2g}" for end in (min, max)) if factors else ()
+            spans += [f"{' to '.join(ends)} times as long for {word}"] if ends else []
+        told += [f"{title} takes {joined(spans)}"] if spans else []
     idle = {k for k in PARTS if all(c.time[0] < _LEAST and c.memory < _LEAST for c in single if c.part == k)}
     idle = [PARTS[k].what for k in PARTS if k in idle and any(c.part == k for c in single)]
     helps = dict.fromkeys(f"{PARTS[c.part].what} on {c.scene}" for c in single if c.time[2] < 1 / _LEAST)
     return (
-        f"Time with all of it put back, by scene: {'; '.join(told)}. Costs nothing anywhere: {joined(idle or ['nothing'])}. "
+        f"With all of it put back, by scene: {'; '.join(told)}. No cost anywhere: {joined(idle or ['nothing'])}. "
         f"Faster with than without: {joined(helps or ['nothing'])}."
     )
 
