@@ -47,7 +47,7 @@ class Settings(RunSettings):
     """How much is measured."""
     sizes: Sizes
     """The numbers that go with the size: those of the file's table of that name."""
-    scenes: dict[SceneName, tuple[PartName, ...]] = {}
+    scenes: dict[SceneName, tuple[PartName, ...]] = Field(default_factory=dict)
     """Scenes in place of the size's, with what MJX is given back in each."""
 
     @property
