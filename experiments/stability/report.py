@@ -24,7 +24,7 @@ from experiments.stability.measure import (
     SceneOutcome,
     against_c,
 )
-from experiments.stability.scenes import AXES, Points, StabilityScene, effective
+from experiments.stability.scenes import PARAMETERS, Points, StabilityScene, effective
 from experiments.theme import REFERENCE, Drawings, power, subplots
 from experiments.words import percent
 from mjxgrad.contact.warnings import largest_stable_step, steepest
@@ -173,16 +173,6 @@ def _cells(values, kinds: type[Motion] | type[Derivative]) -> dict[str, str]:
 # In the order of the items.
 _MOTIONS = ("#c9e3f4", "#9ccbe8", "#cc79a7", "#f0c36d", "#d55e00", "#22262e")
 _DERIVATIVES = ("#66c2a5", "#e8eaed", "#a6341b", "#8c6d31", "#7f3c8d", "#22262e")
-_UNITS = {
-    "timestep": "time step, s",
-    "time_constant": "time constant, s",
-    "stiffness": "direct stiffness, 1/s²",
-    "impedance_first": "impedance at the surface",
-    "width": "width, m",
-    "speed": "speed, m/s",
-    "depth": "depth at the start, radii",
-    "margin": "margin, m",
-}
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -251,8 +241,8 @@ def _planes(one: SceneOutcome, outcome: Outcome) -> tuple[Picture, str, str]:
             if i == 0:
                 where = name if name == C_MUJOCO else f"mjxgrad, {name}"
                 axis.set_title(f"{'Motion' if what == 'motion' else 'Gradient'}\n{where}", fontsize=9.5)
-            axis.set_xlabel(_UNITS.get(across, across.replace("_", " ")), fontsize=9)
-        axes[i, 0].set_ylabel(_UNITS.get(up, up.replace("_", " ")), fontsize=9)
+            axis.set_xlabel(PARAMETERS[across][2], fontsize=9)
+        axes[i, 0].set_ylabel(PARAMETERS[up][2], fontsize=9)
     _legend(figure, one)
     caption = (
         f"Each square is one rollout of {outcome.settings.num_steps} steps, whatever the time step, and its gradient; all "
@@ -268,7 +258,7 @@ def _scales(axis: Axes, across: str, up: str, count: int) -> None:
     """Put ticks at a few of the values that the squares stand for."""
     at = np.unique(np.linspace(0, count - 1, 3).round().astype(int))
     for name, put in ((across, axis.set_xticks), (up, axis.set_yticks)):
-        values = AXES[name](np.linspace(0, 1, count))[at]
+        values = PARAMETERS[name][1](np.linspace(0, 1, count))[at]
         put(at, [_short(value) for value in values])
 
 

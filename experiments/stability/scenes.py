@@ -15,22 +15,6 @@ FIELDS = (
     "geom_solref", "geom_solimp", "geom_friction", "geom_margin", "jnt_solref", "jnt_solimp", "jnt_margin",
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0",
 )  # fmt: skip
-DEFAULTS = {
-    "timestep": 2e-3,
-    "time_constant": 0.02,
-    "damping_ratio": 1.0,
-    "stiffness": 0.0,
-    "impedance_first": 0.9,
-    "impedance_last": 0.95,
-    "width": 1e-3,
-    "mass_ratio": 1.0,
-    "speed": 1.0,
-    "friction": 1.0,
-    "depth": 0.0,
-    "margin": 0.0,
-}
-"""MuJoCo's own contact at its own time step. Stiffness, if any, stands for the direct format; depth is in radii."""
-
 Point = Mapping[str, float]
 State = tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]]
 
@@ -303,14 +287,14 @@ def points(scene: StabilityScene, resolution: int, num_random: int, seed: int) -
     places = np.linspace(0, 1, resolution)
     blocks = []
     for across, up, others in planes:
-        x, y = np.meshgrid(AXES[across](places), AXES[up](places))
+        x, y = np.meshgrid(PARAMETERS[across][1](places), PARAMETERS[up][1](places))
         blocks.append(_block(x.size, others | {across: x.ravel(), up: y.ravel()}))
     names = _RANDOM[scene.family]
     # A plane alone decides whether the format is direct; here every other point is.
     rng = np.random.default_rng(seed)
     strata = rng.permuted(np.tile(np.arange(num_random), (len(names), 1)), axis=1).T
     sample = (strata + rng.random(strata.shape)) / num_random
-    drawn = {name: AXES[name](sample[:, i]) for i, name in enumerate(names)}
+    drawn = {name: PARAMETERS[name][1](sample[:, i]) for i, name in enumerate(names)}
     drawn["stiffness"] = np.where(np.arange(num_random) % 2, drawn["stiffness"], 0.0)
     if "depth" in drawn:
         drawn["depth"] = np.where(np.arange(num_random) % 4 < 3, 0.0, drawn["depth"])
@@ -345,17 +329,20 @@ def _depth(place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return np.where(np.abs(depth - 2) < 0.3, 2.0, depth)
 
 
-AXES: dict[str, Axis] = {
-    "timestep": _powers(1e-4, 5e-2),
-    "time_constant": _powers(1e-5, 1.0),
-    "damping_ratio": _powers(1e-2, 10.0),
-    "stiffness": _powers(1.0, 1e8),
-    "impedance_first": _impedance,
-    "impedance_last": _impedance,
-    "width": _zero_and_powers(1e-6, 0.1),
-    "mass_ratio": _powers(1e-6, 1e6),
-    "speed": _powers(1e-2, 100.0),
-    "friction": _zero_and_powers(1e-3, 10.0),
-    "margin": _zero_and_powers(1e-6, 0.02),
-    "depth": _depth,
+PARAMETERS: dict[str, tuple[float, Axis, str]] = {
+    "timestep": (2e-3, _powers(1e-4, 5e-2), "time step, s"),
+    "time_constant": (0.02, _powers(1e-5, 1.0), "time constant, s"),
+    "damping_ratio": (1.0, _powers(1e-2, 10.0), "damping ratio"),
+    "stiffness": (0.0, _powers(1.0, 1e8), "direct stiffness, 1/s²"),
+    "impedance_first": (0.9, _impedance, "impedance at the surface"),
+    "impedance_last": (0.95, _impedance, "impedance deep inside"),
+    "width": (1e-3, _zero_and_powers(1e-6, 0.1), "width, m"),
+    "mass_ratio": (1.0, _powers(1e-6, 1e6), "mass ratio"),
+    "speed": (1.0, _powers(1e-2, 100.0), "speed, m/s"),
+    "friction": (1.0, _zero_and_powers(1e-3, 10.0), "friction"),
+    "depth": (0.0, _depth, "depth at the start, radii"),
+    "margin": (0.0, _zero_and_powers(1e-6, 0.02), "margin, m"),
 }
+"""Default, values and label of each. The defaults are MuJoCo's own contact at its own time step; stiffness, if any, stands for
+the direct format."""
+DEFAULTS = {name: default for name, (default, _, _) in PARAMETERS.items()}
