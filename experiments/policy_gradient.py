@@ -218,11 +218,6 @@ class Problem:
     num_samples: int  # rollouts of one estimate
     has_jump_of_force: bool  # whether its contacts set in with a force that is not zero
 
-    def objective(self, gradient: str, stddev: float) -> mg.Objective:
-        """Return the task's cost with contact that begins within the step, or with MuJoCo's motion and its derivative."""
-        contact = mg.Onset() if gradient == ONSET else mg.Discrete()
-        return self.task.with_contact(contact).objective(jnp.asarray(stddev))
-
 
 def problem(name: str, settings: Settings) -> Problem:
     """Build one of the tasks that the settings name."""
@@ -231,10 +226,10 @@ def problem(name: str, settings: Settings) -> Problem:
         task = push(stiffness)
         start = Point("start", task.initial_params())
         return Problem(name, f"Push, {stiffness:g} N/m", task, task.stddev, [start], 16, has_jump_of_force=False)
-    return _hopper() if name == "hopper" else _throw(name, settings)
-
-
-def _throw(name: str, settings: Settings) -> Problem:
+    if name == "hopper":
+        task = mg.tasks.hopper()
+        start = Point("start", task.initial_params())
+        return Problem(name, "Hopper", task, 0.1, [start], 32, has_jump_of_force=True)
     is_default = name == "ball_wall_default"
     softness = DEFAULT_CONTACT if is_default else mg.tasks.wall_softness(WALL_STIFFNESS)
     points = [
@@ -246,11 +241,6 @@ def _throw(name: str, settings: Settings) -> Problem:
     title = "Throw, default contact" if is_default else "Throw, gentle contact"
     task = mg.tasks.ball_wall().with_softness(softness)
     return Problem(name, title, task, settings.angle_stddev, points, 50, has_jump_of_force=is_default)
-
-
-def _hopper() -> Problem:
-    task = mg.tasks.hopper()
-    return Problem("hopper", "Hopper", task, 0.1, [Point("start", task.initial_params())], 32, has_jump_of_force=True)
 
 
 @eqx.filter_jit
@@ -291,7 +281,8 @@ def _cell(one: Problem, point: Point, key: PRNGKeyArray, settings: Settings) -> 
 
 
 def _estimates(one: Problem, gradient: str, params: Float[Array, " dim"], keys: Key[Array, " count"]) -> Estimated:
-    objective = one.objective(gradient, one.stddev)
+    contact = mg.Onset() if gradient == ONSET else mg.Discrete()
+    objective = one.task.with_contact(contact).objective(jnp.asarray(one.stddev))
     found = [estimated(objective, params, key, one.num_samples) for key in keys]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 

@@ -237,8 +237,14 @@ FITS: dict[str, tuple[tuple[str, ...], bool]] = {
 }
 BEST = "rounded corners"
 GIVEN = {"nominal": NOMINAL, "fitted by Acosta et al.": PUBLISHED}
-UNITS = {"side": "mm", "radius": "mm", "friction": "", "stiffness": "10³/s²", "damping_ratio": ""}
-_SCALE = {"side": 1e3, "radius": 1e3, "stiffness": 1e-3}
+# What the page calls them, in which unit, and what that is of the SI's.
+SHOWN = {
+    "side": ("side", " mm", 1e3),
+    "radius": ("corner radius", " mm", 1e3),
+    "friction": ("friction", "", 1.0),
+    "stiffness": ("stiffness", " 10³/s²", 1e-3),
+    "damping_ratio": ("damping ratio", "", 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -357,7 +363,8 @@ def answer(outcome: Outcome) -> str:
 def verdict(outcome: Outcome) -> str:
     """Give the numbers with rounded corners, the errors beside those of given numbers, and what the intervals lack."""
     best = outcome.fits[BEST]
-    found = joined(f"{_named(name)} {_quantity(best, name)}" for name in (*CONTACT, "radius"))
+    told = ((name, _quantity(name, best.values[name], best.half_width.get(name))) for name in (*CONTACT, "radius"))
+    found = joined(f"{SHOWN[name][0]} {text}{SHOWN[name][1]}" for name, text in told)
     held = "; ".join(f"{name} {_errors(outcome.judged[name])}" for name in (*GIVEN, BEST))
     return (
         f"From {outcome.settings.num_training} tosses: {found}. "
@@ -371,15 +378,9 @@ def warnings(outcome: Outcome) -> list[str]:
     return [f"{name}: {text}" for name, fit in outcome.fits.items() for text in fit.warnings]
 
 
-def _named(name: str) -> str:
-    return {"damping_ratio": "damping ratio", "radius": "corner radius"}.get(name, name)
-
-
-def _quantity(fit: Fit, name: str) -> str:
-    scale = _SCALE.get(name, 1.0)
-    error = fit.half_width.get(name)
-    value = scale * fit.values[name]
-    return f"{quantity(value, scale * error) if error else f'{value:.4g}'} {UNITS[name]}".strip()
+def _quantity(name: str, value: float, error: float | None) -> str:
+    scale = SHOWN[name][2]
+    return quantity(scale * value, scale * error) if error else f"{scale * value:.4g}"
 
 
 def _errors(judged: Float[np.ndarray, "tosses 4"]) -> str:
@@ -389,14 +390,12 @@ def _errors(judged: Float[np.ndarray, "tosses 4"]) -> str:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate what was found, and what it is worth."""
-    heads = {n: f"{_named(n)} ({u})" if u else _named(n) for n, u in UNITS.items()}
+    heads = {name: f"{label} ({unit.strip()})" if unit else label for name, (label, unit, _) in SHOWN.items()}
+    numbers = {name: (values, {}) for name, values in GIVEN.items()}
+    numbers |= {name: (fit.values, fit.half_width) for name, fit in outcome.fits.items()}
     rows = [
-        {"": name} | {head: f"{_SCALE.get(n, 1.0) * values[n]:.4g}" for n, head in heads.items()}
-        for name, values in GIVEN.items()
-    ]
-    rows += [
-        {"": name} | {head: _quantity(fit, n).removesuffix(f" {UNITS[n]}") for n, head in heads.items()}
-        for name, fit in outcome.fits.items()
+        {"": name} | {head: _quantity(n, values[n], widths.get(n)) for n, head in heads.items()}
+        for name, (values, widths) in numbers.items()
     ]
     caption = "Numbers of the cube, with 95% intervals where they were looked for; the others stay nominal."
     found = tabulated(rows, caption)
