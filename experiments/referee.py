@@ -54,14 +54,14 @@ class Sizes(SettingsTable):
     num_starts: Annotated[int, Field(ge=32)]
     """At which each engine is differentiated."""
     budget: Positive
-    """Seconds of all gradients of a contestant in a scene, beyond which it is asked at half of the starts, 32 at least."""
+    """Seconds of all gradients of a contestant in a scene, beyond which it is asked at fewer starts, 32 at least."""
 
 
 class Settings(RunSettings):
     """Error of gradients through contact against their time, by engine."""
 
-    size: Literal["quick", "default"] = "default"
-    """Two scenes and what is installed in a minute or two, or all scenes and engines."""
+    size: Literal["quick", "default", "full"] = "default"
+    """Two scenes and what is installed anyway; all engines; the hopper, too, whose compilation takes longest."""
     sizes: Sizes
     """The numbers that go with the size: those of the file's table of that name."""
 

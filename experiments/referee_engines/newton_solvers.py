@@ -31,7 +31,10 @@ def _build(scene: Scene) -> newton.ModelBuilder:
     look.mu, solid = scene["friction"], wp.diag(wp.vec3(*[scene["inertia"]] * 3))
     bodies = [builder.add_body(xform=_at(start), mass=scene["mass"], inertia=solid) for start in scene["starts"]]
     balls = [(body, place, scene["radius"]) for body in bodies for place in scene["balls"]]
-    for body, place, radius in balls + [(-1, *side) for side in scene["sides"]]:
+    # Of balls that belong to the world its penalties forget the radius; a body without mass stays where it is, too.
+    at_rest = {"mass": 0.0, "is_kinematic": True}
+    balls += [(builder.add_body(xform=_at(place), **at_rest), (0, 0, 0), size) for place, size in scene["sides"]]
+    for body, place, radius in balls:
         builder.add_shape_sphere(body, xform=_at(place), radius=radius, cfg=look)
     if scene["floor"]:
         builder.add_ground_plane(cfg=look)

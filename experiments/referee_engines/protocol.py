@@ -1,7 +1,7 @@
 """What an engine's program reads and writes: a JSON request on stdin, then one JSON line per scene and variant on stdout.
 
 The request holds `scenes` (as in scenes.toml, with their `values`), `variants`, `packages` whose versions the first line tells,
-and the `budget`, seconds beyond which half of the values do. A program is `serve(make)`, where `make(scene, variant)` returns
+and the `budget`, seconds beyond which fewer values do. A program is `serve(make)`, where `make(scene, variant)` returns
 two functions of a value: the outcome with its derivative, and the outcome. It runs in an environment of its own.
 """
 
@@ -51,8 +51,10 @@ def measure(make: Callable[[Scene, str], Pair], scene: Scene, variant: str, budg
     gradient(values[0])
     found: dict[str, Any] = {"compile_seconds": time.perf_counter() - begun}
     rollout(values[0])
-    is_slow = len(values) >= 2 * _FEWEST and _timed(gradient, values[:1])[1][0] * len(values) > budget
-    found["values"] = values[:: 2 if is_slow else 1]
+    seconds, every = _timed(gradient, values[:1])[1][0], 1
+    while seconds * len(values[::every]) > budget and len(values) >= 2 * every * _FEWEST:
+        every *= 2
+    found["values"] = values[::every]
     pairs, found["gradient_seconds"] = _timed(gradient, found["values"])
     _, found["rollout_seconds"] = _timed(rollout, found["values"][:_ROLLOUTS])
     found["outcomes"], found["derivatives"] = ([float(pair[i]) for pair in pairs] for i in (0, 1))
