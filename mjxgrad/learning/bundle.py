@@ -10,6 +10,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from mjxgrad._arrays import real, whole
@@ -36,7 +37,7 @@ class Bundle:
 
     def __post_init__(self):
         whole("num_branches", self.num_branches)
-        if min(real("spreads and force", dataclasses.astuple(self)[1:])) < 0:
+        if np.asarray(real("spreads and force", dataclasses.astuple(self)[1:])).min() < 0:
             raise ValueError(f"spreads and force must not be negative, got {self}")
 
     def step_on(self, environment: Environment, state: EnvState, action: Float[Array, " nu"]):
