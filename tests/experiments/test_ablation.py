@@ -15,14 +15,12 @@ def _starts(name):
     return starts_of(file_of(name).compile(), 2, 3, 0)
 
 
-_OF_MOTION = ["storage", "rows", "forces", "cold", "columns", "record", "carry", "numbers", "mjx.step"]
-
-
 @pytest.mark.parametrize(
     ("name", "work", "keys"),
     [
-        ("sensing_arm", "forward", _OF_MOTION),
-        ("sensing_arm", "gradient", ["values"]),
+        ("cartpole", "forward", ["rows", "forces", "record", "carry", "numbers", "mjx.step"]),
+        ("cartpole", "gradient", ["values"]),
+        ("sensing_arm", "forward", ["storage", "cold", "columns"]),
         ("ball_wall", "forward", ["damping"]),
     ],
 )
