@@ -104,7 +104,7 @@ class Cell:
     def told_error(self) -> str:
         """The error in words."""
         if not math.isfinite(self.error):
-            return "not finite"
+            return "no slope" if math.isnan(self.error) else "not finite"
         is_wild = max(self.error, self.standard_error) > _HIGH
         return f"{quantity(self.error)} times" if is_wild else f"{percent(self.error)} ± {percent(self.standard_error)}"
 
@@ -201,9 +201,12 @@ def cell(engine: str, answer: dict[str, Any], precision: str = "float64") -> Cel
     found, outcomes = np.array(answer["derivatives"], float), np.array(answer["outcomes"], precision)
     is_finite = np.isfinite(found)
     compared = compare_to_slope(np.array(answer["values"]), outcomes, [np.where(is_finite, found, 0)], ["own"])
-    slope, scale = float(compared.slope), max(abs(float(compared.slope)), float(compared.resolution))
-    relative = [float(np.abs(one[0])) / scale for one in (compared.error, compared.standard_error, compared.spread)]
-    errors = relative if is_finite.all() else [math.inf, math.nan, math.nan]
+    slope = float(compared.slope)
+    errors = [float(np.abs(one[0] / slope)) for one in (compared.error, compared.standard_error, compared.spread)]
+    if abs(slope) <= float(compared.resolution):
+        errors = 3 * [math.nan]
+    elif not is_finite.all():
+        errors = [math.inf, math.nan, math.nan]
     times = [np.quantile(answer[one], [0.5, 0.25, 0.75]).tolist() for one in ("gradient_seconds", "rollout_seconds")]
     numbers = len(found), int(is_finite.sum()), float(outcomes.mean()), slope, float(compared.slope_error)
     named = answer["scene"], engine, answer["variant"]
@@ -294,6 +297,7 @@ def error_against_time(outcome: Outcome):
             axis.plot(cell.seconds[0], np.clip(cell.error, _LOW, _HIGH), ls="", ms=6, marker=marker, **look)
         axis.axhline(_RIGHT, color=MUTED, lw=0.8, ls=(0, (3, 2)))
         axis.set(xscale="log", yscale="log", title=name, ylim=(_LOW / 1.6, _HIGH * 1.6), xlabel="seconds of a gradient")
+        axis.tick_params(labelbottom=True)
         plain(axis.xaxis)
     figure.supylabel("error over slope")
     named = {label: h for axis in axes.flat for h, label in zip(*axis.get_legend_handles_labels(), strict=True)}

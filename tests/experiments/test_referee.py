@@ -97,6 +97,12 @@ def test_a_derivative_that_is_not_finite_is_infinitely_wrong(cells):
     assert not lost.is_right
 
 
+def test_an_outcome_that_does_not_move_has_no_slope_to_be_right_about(answers):
+    still = answers[5] | {"outcomes": [0.1] * 32, "derivatives": [0.0] * 32}
+    assert cell("brax", still).told_error == "no slope"
+    assert not cell("brax", still).is_right
+
+
 def test_the_sledge_stops_where_coulomb_friction_stops_it():
     """C MuJoCo's friction is soft, and the first step is without it: within 2 %."""
     scene = scenes(32)["slide"]
