@@ -51,8 +51,8 @@ class Settings(RunSettings):
     """Distance from it that counts as reached (degrees)."""
     position_tolerance: Positive = 0.03
     """The same for the place of the body (m)."""
-    max_extension: Annotated[int, Field(ge=1)] = 3
-    """Most steps of a tree towards one sample."""
+    batch: Annotated[int, Field(ge=1)] = 16
+    """Samples of a tree at a time; where steps are slow, fewer make it deeper in the same time."""
     num_iterations: Annotated[int, Field(ge=1)] = 10
     """Iterations of trajectory optimisation after a tree; alone twice as many."""
     size: Literal["default", "quick"] = "default"
@@ -123,13 +123,13 @@ class Problem:
         """Return the changes of states from a start."""
         return np.asarray(jax.vmap(self.system.difference, (0, None))(states, start))
 
-    def tree(self, arm: str, max_extension: int) -> Tree:
+    def tree(self, arm: str, batch: int) -> Tree:
         """Return the planner of an arm."""
         upper, (place, turn) = self.changes(1.0, self.near[0], 3 * self.near[1], 0.0), self.near
         lower, upper[self.turn.stop - 1] = -upper, 3 * turn + self.angle
         return Tree(
             self.system, self.goal, self.changes(np.inf, place, turn, np.inf), lower=lower, upper=upper, reach=_REACH,
-            resolution=self.changes(0.2, 0.02, 0.1, np.inf), max_extension=max_extension,
+            resolution=self.changes(0.2, 0.02, 0.1, np.inf), batch=batch,
             smoother=Exact() if arm == UNSMOOTHED else Sampled(None, _STDDEV, 20 + len(self.control)),
         )  # fmt: skip
 
@@ -170,7 +170,7 @@ def _block() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Search by every arm from every seed."""
     problem, attempts, count = Problem(settings), [], settings.sizes.num_seeds
-    trees = {arm: problem.tree(arm, settings.max_extension) for arm in (SMOOTHED, UNSMOOTHED)}
+    trees = {arm: problem.tree(arm, settings.batch) for arm in (SMOOTHED, UNSMOOTHED)}
     with workspace.stage("search", "attempts", len(ARMS) * count) as advance_to:
         for number in range(len(ARMS) * count):
             arm, seed = ARMS[number % len(ARMS)], settings.seed + number // len(ARMS)
