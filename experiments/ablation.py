@@ -205,29 +205,21 @@ def _single(outcome: Outcome) -> list[Cost]:
 
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate each engine's factors."""
-    found, sizes = [], outcome.settings.sizes
+    found, sizes, order = [], outcome.settings.sizes, list(PARTS)
+    scenes: list[str] = list(outcome.settings.chosen)
     for engine, title in _TITLES.items():
-        rows, emphasised, costs = [], set(), {(c.scene, c.part, c.work): c for c in outcome.costs if c.engine == engine}
-        for scene, key in dict.fromkeys((c.scene, c.part) for c in costs.values()):
-            row = [scene, PARTS[key].what, PARTS[key].why]
-            for work in ("forward", "gradient"):
-                cost = costs.get((scene, key, work))
-                emphasised |= {(len(rows), len(row))} if cost and cost.time[0] > _LEAST else set()
-                row += _cells(cost) if cost else [""] * 4
-            rows.append(row)
-        parts = ("time", "memory", "compilation", "difference")
-        columns = (
-            "scene",
-            f"back into {title}",
-            "why not",
-            *(f"{w}, {x}" for w in ("motion", "gradient") for x in parts),
-        )
+        costs = [cost for cost in outcome.costs if cost.engine == engine]
+        costs.sort(key=lambda cost: (scenes.index(cost.scene), order.index(cost.part), cost.work))
+        rows = [[c.scene, PARTS[c.part].what, PARTS[c.part].why, c.work, *_cells(c)] for c in costs]
         caption = (
             "Factors over the program without, whose own numbers the last rows of a scene tell: time with quartiles over turns, "
             "bold where these are above 1.1; memory beside arguments. Differences over the largest result; * beyond rounding. "
             f"{sizes.horizon} steps of {sizes.batch if engine == 'mjx' else sizes.few} rollouts."
         )
-        found.append(Table(columns, rows, caption, frozenset(emphasised)))
+        columns = ("scene", f"back into {title}", "why not", "work", "time", "memory", "compilation", "difference")
+        found.append(
+            Table(columns, rows, caption, frozenset((i, 4) for i, c in enumerate(costs) if c.time[0] > _LEAST))
+        )
     return found
 
 
