@@ -147,12 +147,8 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Measure every case."""
-    found = []
-    with workspace.stage("discontinuities", "cases", len(CASES)) as advance_to:
-        for case in CASES:
-            found.append(workspace.once(case.title, functools.partial(measured, case, settings)))
-            advance_to(len(found))
-    return Outcome(settings, found)
+    parts = {case.title: functools.partial(measured, case, settings) for case in CASES}
+    return Outcome(settings, workspace.each("discontinuities", "cases", parts))
 
 
 def measured(case: Case, settings: Settings) -> Found:
@@ -202,24 +198,25 @@ def secant_slope(simulate: Callable, place: float, stddev: float, count: int, se
 
 
 def answer(outcome: Outcome) -> str:
-    """Say how wrong first order is across the jumps, and what finds the slope."""
+    """Say how wrong first order is across the jumps, and with rounded geometry."""
     every = [row for one in outcome.found for row in one.rows]
     least = min(row.error for row in every if row.remedy == PLAIN)
-    worst = max(row.error for row in every if row.derivative == "alpha order")
-    return f"First order is off by {percent(least)} and more, α-order by {percent(worst)} at most."
+    worst = max(row.own_error for row in every if (row.remedy, row.derivative) == (ROUNDED, "slope"))
+    return f"First order is off by {percent(least)} at least; with rounded geometry by {percent(worst)} at most."
 
 
 def verdict(outcome: Outcome) -> str:
-    """Say what each case does, and which remedy is nearest."""
+    """Say what each case does, and what rounding makes of it."""
     told = []
     for one in outcome.found:
         errors = joined(
             f"{percent(row.error)} ({row.derivative})" for row in one.rows if row.remedy in (PLAIN, "noise")
         )
-        best = min((row for row in one.rows if row.remedy not in (PLAIN, "noise")), key=lambda row: row.error)
+        rounded = [row for row in one.rows if row.remedy == ROUNDED]
+        own = joined(f"{percent(row.own_error)} ({row.derivative})" for row in rounded)
         told.append(
-            f"{best.case}: the outcome jumps by {percent(one.rows[0].jump)} of its range; gradients are off by {errors}; the "
-            f"nearest remedy is {best.remedy} ({percent(best.error)}), which changes the outcome by {percent(best.change)}"
+            f"{rounded[0].case}: the outcome jumps by {percent(one.rows[0].jump)} of its range; gradients are off by {errors}; "
+            f"rounded, by {own} of the slope of an outcome that differs by {percent(rounded[0].change)} of the range"
         )
     return "; ".join(told) + "."
 

@@ -105,7 +105,6 @@ class Found:
 class Outcome:
     """All that was found."""
 
-    settings: Settings
     found: list[Found]
 
     def rows(self) -> list[dict[str, Any]]:
@@ -119,12 +118,8 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Measure every problem."""
-    with workspace.stage("horizons", "problems", 3) as advance_to:
-        found = []
-        for one in problems():
-            found.append(workspace.once(one.title, functools.partial(measured, one, settings)))
-            advance_to(len(found))
-    return Outcome(settings, found)
+    parts = {one.title: functools.partial(measured, one, settings) for one in problems()}
+    return Outcome(workspace.each("horizons", "problems", parts))
 
 
 def measured(one: Problem, settings: Settings) -> Found:
@@ -170,9 +165,8 @@ def measured(one: Problem, settings: Settings) -> Found:
 def _in_parts(function: Callable, noise: np.ndarray, count: int) -> Any:
     """Map over noise in parts, so that memory does not grow."""
     compiled = jax.jit(jax.vmap(function))
-    return jax.tree.map(
-        lambda *x: np.concatenate(x), *(compiled(noise[i : i + count]) for i in range(0, len(noise), count))
-    )
+    parts = [compiled(noise[i : i + count]) for i in range(0, len(noise), count)]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def _costs(one: Problem, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -198,11 +198,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     descents: list[Any] = list(itertools.product(("boxes", "pressure"), ("first_order", "zeroth_order", "alpha_order")))
     jobs |= {at: functools.partial(_share, settings, *at) for at in holes}
     jobs |= {at: functools.partial(_descents, settings, own, *at) for at in descents}
-    with workspace.stage("mating", "parts", len(jobs)) as advance_to:
-        found = {}
-        for at, job in jobs.items():
-            found[at] = workspace.once(str(at), job)
-            advance_to(len(found))
+    found = dict(zip(jobs, workspace.each("mating", "parts", {str(at): job for at, job in jobs.items()}), strict=True))
     return Outcome(settings, *([found[k] for k in kinds], *({at: found[at] for at in x} for x in (holes, descents))))
 
 
@@ -315,7 +311,7 @@ def depths(outcome: Outcome):
     left.legend(fontsize=8.5)
     caption = (
         "Left, how deep the peg goes by its offset from the hole. Right, derivatives of single rollouts under noise about the "
-        "steepest place of each (dashes), their mean (dots), and the slope of the mean depth (diamonds); what lies beyond 1000 is "
-        "at the edge."
+        "steepest place of each (dashes), their mean (dots), and the slope of the mean depth (diamonds); what lies beyond "
+        "1000 is at the edge."
     )
     return figure, "Depth of the peg by how contact is told, and its derivatives", caption
