@@ -159,8 +159,8 @@ def _block() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
         raise ExperimentError(f"the hand of gymnasium-robotics could not be downloaded: {error}") from error
     spec = mujoco.MjSpec.from_file(str(folder / "manipulate_block.xml"))
     spec.delete(spec.joint("target:joint"))  # the goal of gymnasium's own tasks is a free body that falls
-    spec.body("target").pos = [1.1, 0.8, 0.2]
-    spec.worldbody.add_camera(name="above", pos=[0.855, 0.649, 0.515], quat=[0.908, 0.331, -0.089, -0.243])
+    spec.body("target").pos = [1.09, 0.81, 0.2]
+    spec.worldbody.add_camera(name="above", pos=[0.855, 0.649, 0.515], quat=[0.908, 0.331, -0.089, -0.243], fovy=37)
     data = mujoco.MjData(model := spec.compile())
     data.ctrl[:] = [0.5 * (model.actuator(i).name[-3:] in ("FJ2", "FJ1")) for i in range(model.nu)]
     mujoco.mj_step(model, data, 1500)
