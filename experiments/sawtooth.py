@@ -300,8 +300,8 @@ def _by_mujoco(
     """Give samples by C MuJoCo, under controls or a policy that are zero; without an arm readings alone."""
     scene, steps = mg.load_scene(model, engine="mujoco"), int(rows[-1])
     controls = jnp.zeros((steps, model.nu))
-    how = {"controls": (lambda _, state: controls[0]), "horizon": steps} if arm == POLICY else {"controls": controls}
-    how["contact"] = own_motion(_BY_MUJOCO[arm] if arm else "discrete")
+    acts, horizon = ((lambda _, state: controls[0]), steps) if arm == POLICY else (controls, None)
+    how = {"controls": acts, "horizon": horizon, "contact": own_motion(_BY_MUJOCO[arm] if arm else "discrete")}
     return jax.jit(lambda at: _sample(scene, one, at, rows, arm is not None, **how))(parameters)
 
 

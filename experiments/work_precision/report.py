@@ -191,6 +191,9 @@ def _all_scenes(outcome: Outcome):
     """Draw the least time to each error, scene by scene: of the motion on the left, of the gradient on the right."""
     targets, count = sorted(outcome.settings.targets, reverse=True), len(outcome.courses)
     figure, axes = subplots(1, 2, height=1.6 + 0.4 * count, sharey=True)
+    logarithmic(
+        axes[0, 0].xaxis, axes[0, 1].xaxis
+    )  # before a curve that may be empty, which a linear axis puts about zero
     ways = dict.fromkeys(one.estimator for course in outcome.courses for one in course.estimates)
     for i, course in enumerate(outcome.courses):
         for axis, names, markers, shift in (
@@ -199,17 +202,21 @@ def _all_scenes(outcome: Outcome):
         ):
             for j, (name, marker) in enumerate(zip(names, markers, strict=False)):
                 is_motion = axis is axes[0, 0]
-                found = [_least(course, name, target, is_motion=is_motion) for target in targets]
                 place = i + shift * (j - 0.5 * (len(names) - 1))
-                colour = _COLOURS[name] if is_motion else _ESTIMATORS[name]
-                axis.plot(found, [place] * len(found), "-", color=colour, lw=1.2)
-                look = {"marker": marker, "color": colour, "ls": ""}
-                axis.plot(found[0], place, ms=6, label="_" if i else name, **look)
-                axis.plot(found[1:], [place] * len(found[1:]), ms=4, mfc="white", **look)
+                found = np.array([(_least(course, name, target, is_motion=is_motion), place) for target in targets])
+                for part, look in (
+                    (found, {"lw": 1.2}),
+                    (found[:1], {"marker": marker, "ls": "", "ms": 6, "label": "_" if i else name}),
+                    (found[1:], {"marker": marker, "ls": "", "ms": 4, "mfc": "white"}),
+                ):
+                    axis.plot(
+                        *part[np.isfinite(part[:, 0])].T,
+                        color=_COLOURS[name] if is_motion else _ESTIMATORS[name],
+                        **look,
+                    )
     for axis, title, side in zip(axes[0], ("motion", "gradient"), ("left", "right"), strict=True):
         what = "second of motion and state" if title == "motion" else "estimate"
         axis.set(title=f"time to an error of the {title}", xlabel=f"seconds per {what}")
-        logarithmic(axis.xaxis)
         figure.legend(*axis.get_legend_handles_labels(), fontsize=8, loc=f"outside lower {side}", ncols=3)
     axes[0, 0].set_ylim(-0.6, count - 0.4)
     axes[0, 0].set_yticks(range(count), [course.title for course in outcome.courses])
@@ -254,8 +261,8 @@ def _drawn(course: Course, outcome: Outcome):
         axis.axhline(max(known, _SMALLEST), **_KNOWN)
         for target in outcome.settings.targets:
             axis.axhline(target, color=MUTED, lw=0.6, alpha=0.7, zorder=0)
-        axis.set(yscale="log", xlabel=f"wall-clock {what}")
         logarithmic(axis.xaxis)
+        axis.set(yscale="log", xlabel=f"wall-clock {what}")
     left.set(title="error of the final state, relative", ylabel="error")
     right.set(title="error of the gradient, relative")
     names = {variant.integrator for variant in (one.variant for one in course.points)}
