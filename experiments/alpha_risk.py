@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import ASSETS, own_task
+from experiments.motion import own_task
 from experiments.optimisation.published import TASKS
-from experiments.problems import textbook
+from experiments.problems import ASSETS, textbook
 from experiments.report import Bold, Table, tabulated
 from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, ZEROTH, Drawings, subplots

@@ -25,7 +25,6 @@ class Method(SettingsTable):
     wheels: Literal["cylinder", "capsule"] = "cylinder"
     engine: Literal["mujoco", "mjx"] = "mujoco"
     gradient: Literal["discrete", "slope"] = "discrete"
-    ccd_tolerance: Positive = 1e-14
     num_steps: PositiveInt
     num_samples: PositiveInt = 1
     stddev: Positive = 0.1
@@ -82,7 +81,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 def _descents(one: Method, count: int) -> list[Descent]:
     given = one.model_dump(exclude={"label"})
-    task = box_crossing(*(given.pop(name) for name in ("wheels", "engine", "gradient", "ccd_tolerance")))
+    task = box_crossing(*(given.pop(name) for name in ("wheels", "engine", "gradient")))
     return [descend(task, seed=42 + i, **given) for i in range(count)]
 
 

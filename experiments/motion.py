@@ -1,10 +1,8 @@
 """One stepping loop for all experiments, and own tasks."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
@@ -22,8 +20,6 @@ Read = Callable[[Float[Array, " nq"], Float[Array, " nv"]], Float[Array, "..."]]
 DISCRETE, SLOPE, CONTINUOUS = "discrete", "slope", "continuous onset"
 ARMS: dict[str, Contact] = {DISCRETE: mg.Discrete(), SLOPE: mg.Slope(), CONTINUOUS: mg.Onset()}
 
-ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-"""Of gymnasium's robots."""
 _STATE = ("qpos", "qvel", "act", "time", "qacc_warmstart")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 import mjxgrad as mg
 from experiments.benchmarks import announce
-from experiments.motion import ASSETS
+from experiments.problems import ASSETS
 from mjxgrad import planning
 from mjxgrad.tasks import scene_path
 

@@ -19,7 +19,8 @@ from matplotlib.lines import Line2D
 from pydantic import Field
 
 import mjxgrad as mg
-from experiments.motion import ARMS, ASSETS, CONTINUOUS, DISCRETE, SLOPE, Read, own_task
+from experiments.motion import ARMS, CONTINUOUS, DISCRETE, SLOPE, Read, own_task
+from experiments.problems import ASSETS
 from experiments.report import Table, tabulated
 from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, REFERENCE, ZEROTH, Drawings, subplots

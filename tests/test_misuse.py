@@ -321,7 +321,7 @@ FOUND = {
     "optimise(log=lambda metrics: None)": "log must be a function of step and metrics, got function: too many positional",
     "optimise(evaluate=3)": "evaluate must be a function of params, got int",
     "optimise(annealing='linear')": "annealing must be a function of step, got str",
-    "optimise(estimator=estimators.first_order)": "missing a required argument: 'num_samples'",
+    "optimise(estimator=estimators.first_order)": "argument: 'num_samples'",
     "optimise(estimator=functools.partial(estimators.first_order, num_samples=4, seed=0))": "unexpected keyword argument 'seed'",
     "learn(log=3)": "log must be a function of step and metrics, got int",
     "learn(log=lambda: None)": "log must be a function of step and metrics, got function",

@@ -8,17 +8,16 @@ import tracemalloc
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 from unittest import mock
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 import mjxgrad as mg
+from experiments.problems import ASSETS
 from mjxgrad._mjx import mjx
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.engines import inverse
@@ -33,7 +32,6 @@ PartName = Literal[
     "damping", "storage", "rows", "forces", "pairs", "room", "cold", "columns", "record", "carry", "values", "numbers",
     "solution", "stages", "geoms",
 ]  # fmt: skip
-_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _MOST_PAIRS = 6
 _LITTLE = 1e-25  # of what must act, so that no step can know that it does next to nothing
 _SCALAR = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
@@ -79,7 +77,7 @@ def patched(parts: Sequence[Part]) -> Iterator[None]:
 
 def file_of(name: str) -> mujoco.MjSpec:
     """Return a scene's file; the sensing arm is the falling one with sensors and sparse matrices."""
-    theirs = _ASSETS / f"{name}.xml"
+    theirs = ASSETS / f"{name}.xml"
     own = theirs if theirs.exists() else scene_path("falling_arm" if name == "sensing_arm" else name)
     spec = mujoco.MjSpec.from_file(str(own))
     if name == "sensing_arm":

@@ -43,11 +43,10 @@ def test_what_capsules_find_holds_on_cylinders(capsules):
     assert float(box_crossing().loss(descend(capsules, "least_squares", 6).params)) < 0.074
 
 
-def test_cylinders_have_derivatives_only_where_their_contacts_are_found_finely():
+def test_cylinders_have_derivatives_whatever_the_tolerance_of_their_contacts():
+    """Derivatives search for contacts to the end; by the tolerance of the motion they were beyond 1e6."""
     norms = [descend(box_crossing(ccd_tolerance=x), "first_order", 1).gradient_norm[0] for x in (1e-14, 1e-6)]
-    fine, usual = norms
-    assert fine < 1
-    assert usual > 1e6
+    assert max(norms) < 1
 
 
 def descents(seconds, losses, norm=1.0):
