@@ -106,7 +106,9 @@ def _with_forces(spec: mujoco.MjSpec) -> bool:
     option.density, option.viscosity = option.density or _LITTLE, option.viscosity or _LITTLE
     spec.bodies[-1].gravcomp = spec.bodies[-1].gravcomp or _LITTLE
     spec.add_tendon(name="loose").wrap_joint(joint.name, 1.0)
-    spec.add_actuator(name="idle", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gainprm=np.zeros(10))
+    # A file's defaults may make a servo of it.
+    idle = {"gainprm": np.zeros(10), "biasprm": np.zeros(10), "biastype": mujoco.mjtBias.mjBIAS_NONE}
+    spec.add_actuator(name="idle", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, **idle)
     return True
 
 
