@@ -217,7 +217,8 @@ def _all_scenes(outcome: Outcome):
     for axis, title, side in zip(axes[0], ("motion", "gradient"), ("left", "right"), strict=True):
         what = "second of motion and state" if title == "motion" else "estimate"
         axis.set(title=f"time to an error of the {title}", xlabel=f"seconds per {what}")
-        figure.legend(*axis.get_legend_handles_labels(), fontsize=8, loc=f"outside lower {side}", ncols=3)
+        handles, labels = axis.get_legend_handles_labels()
+        figure.legend(handles, labels, fontsize=8, loc=f"outside lower {side}", ncols=3)
     axes[0, 0].set_ylim(-0.6, count - 0.4)
     axes[0, 0].set_yticks(range(count), [course.title for course in outcome.courses])
     axes[0, 0].invert_yaxis()
