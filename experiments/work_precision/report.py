@@ -218,7 +218,7 @@ def _all_scenes(outcome: Outcome):
         what = "second of motion and state" if title == "motion" else "estimate"
         axis.set(title=f"time to an error of the {title}", xlabel=f"seconds per {what}")
         handles, labels = axis.get_legend_handles_labels()
-        figure.legend(handles, labels, fontsize=8, loc=f"outside lower {side}", ncols=3)
+        figure.legend(handles, labels, fontsize=8, loc=f"outside lower {side}", ncols=3)  # pyright: ignore[reportArgumentType]
     axes[0, 0].set_ylim(-0.6, count - 0.4)
     axes[0, 0].set_yticks(range(count), [course.title for course in outcome.courses])
     axes[0, 0].invert_yaxis()
