@@ -12,6 +12,13 @@ from mjxgrad._mjx import mjx
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
+# Straight up from a floor, without gravity: its mean motion under noise on the distance is a closed form.
+PUSHED_BALL = """<mujoco><option timestep="{h}" gravity="0 0 0" tolerance="1e-12"/><worldbody>
+  <geom name="floor" type="plane" size="1 1 .1"/><body><joint name="z" type="slide" axis="0 0 1"/>
+  <geom name="ball" size="0.1" mass="1" pos="0 0 0.1"/></body></worldbody>
+  <contact><pair geom1="ball" geom2="floor" condim="1" {contact}/></contact>
+  <actuator><motor joint="z"/></actuator></mujoco>"""
+
 # Everything the step has a formula for, on nine small bodies. Only the floor collides, so that the rows stay few.
 ZOO = """
 <mujoco>

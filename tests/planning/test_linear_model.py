@@ -14,6 +14,7 @@ from mjxgrad.planning.linear_model import Analytic, Exact
 from mjxgrad.planning.system import SceneSystem
 from mjxgrad.planning.trajectory import checked
 from mjxgrad.stepping import Smoothing, own_motion
+from tests.scenes import PUSHED_BALL
 
 POINT, CONTROL, STDDEV = 0.03, jnp.zeros(1), 0.05
 
@@ -65,11 +66,6 @@ def test_smoothing_that_reaches_the_floor_under_a_resting_body_is_warned_about(h
     jax.eval_shape(lambda x: Analytic(Smoothing(0.01)).warnings(system, x), start)
 
 
-BALL = """<mujoco><option timestep="{h}" gravity="0 0 0" tolerance="1e-12"/><worldbody>
-  <geom name="floor" type="plane" size="1 1 .1"/><body><joint name="z" type="slide" axis="0 0 1"/>
-  <geom name="ball" size="0.1" mass="1" pos="0 0 0.1"/></body></worldbody>
-  <contact><pair geom1="ball" geom2="floor" condim="1" {contact}/></contact>
-  <actuator><motor joint="z"/></actuator></mujoco>"""
 IMPEDANCE = 1e-3
 
 
@@ -79,7 +75,7 @@ def test_a_contact_averaged_in_the_solver_is_its_closed_form():
     contact = f'solref="-{given} 0" solimp="{IMPEDANCE} {IMPEDANCE} 0.001"'
     # MuJoCo takes a body's inverse inertia for the mean over three axes, of which one can move here: a third of it.
     k = 3 * given
-    system = SceneSystem(mg.load_scene(BALL.format(h=h, contact=contact)))
+    system = SceneSystem(mg.load_scene(PUSHED_BALL.format(h=h, contact=contact)))
     model = eqx.filter_jit(analytic)(system, jnp.array([POINT, 0.0]), CONTROL, Smoothing(STDDEV))
     slope = -h * k * norm.cdf(-POINT / STDDEV)
     # The share d of all acceleration into the contact is no spring's.

@@ -19,6 +19,7 @@ from mjxgrad.planning import (
     optimise_trajectory,
 )
 from mjxgrad.stepping import Smoothing
+from tests.scenes import PUSHED_BALL
 
 A, B, OFFSET = np.array([[0.9, 0.2], [-0.3, 1.1]]), np.array([[0.5], [-0.7]]), np.array([0.3, -0.1])
 POINT, CONTROL, STDDEV = 0.03, jnp.zeros(1), 0.05
@@ -123,11 +124,6 @@ def test_a_column_without_noise_is_unknown_and_costs_no_samples(key):
         Sampled(0.1, 0.1, 4).linear_model(*at)
 
 
-BALL = """<mujoco><option timestep="{h}" gravity="0 0 0" tolerance="1e-12"/><worldbody>
-  <geom name="floor" type="plane" size="1 1 .1"/><body><joint name="z" type="slide" axis="0 0 1"/>
-  <geom name="ball" size="0.1" mass="1" pos="0 0 0.1"/></body></worldbody>
-  <contact><pair geom1="ball" geom2="floor" condim="1" {contact}/></contact>
-  <actuator><motor joint="z"/></actuator></mujoco>"""
 IMPEDANCE = 1e-3
 
 
@@ -138,7 +134,7 @@ def test_three_ways_agree_on_a_soft_contact(key, engine):
     contact = f'solref="-{given} 0" solimp="{IMPEDANCE} {IMPEDANCE} 0.001"'
     # MuJoCo takes a body's inverse inertia for the mean over three axes, of which one can move here: a third of it.
     slope = -h * 3 * given * norm.cdf(-POINT / STDDEV)
-    scene = mg.load_scene(BALL.format(h=h, contact=contact), engine=engine)
+    scene = mg.load_scene(PUSHED_BALL.format(h=h, contact=contact), engine=engine)
     at = (SceneSystem(scene), jnp.array([POINT, 0.0]), CONTROL)
     share = IMPEDANCE * h * 3 * given  # of all acceleration into the contact, which is no spring's
     noise = {"stddev_state": jnp.array([STDDEV, 1e-3]), "stddev_control": 0.1, "num_samples": 50}
