@@ -8,6 +8,7 @@ records.
 import copy
 import functools
 import itertools
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -37,6 +38,8 @@ from mjxgrad.objective import Differentiated, Objective
 C, MG, MJX, ONSET = "C MuJoCo", "mg.step", "mjx.step", "mg.step, onset"
 Ends = tuple[Float[np.ndarray, "batch nq"], Float[np.ndarray, "batch nv"]]
 Integrator = Literal["Euler", "implicitfast", "RK4"]
+# jax 0.11.2 ended the process where threads that loaded at once traced the same function.
+_LOADING = threading.Lock()
 _INTEGRATORS: dict[Integrator, mujoco.mjtIntegrator] = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -228,7 +231,8 @@ class Program:
         self.case, self.variant, self.batch = case, variant, batch
         begun, dtype = time.perf_counter(), np.dtype(variant.precision)
         with jax.enable_x64(variant.precision == "float64"):
-            scene = mg.load_scene(_c_model(case, variant))
+            with _LOADING:
+                scene = mg.load_scene(_c_model(case, variant))
             start = scene.data.replace(
                 qpos=jnp.asarray(case.start[0], dtype),
                 ctrl=jnp.asarray(case.controls, dtype),
