@@ -287,6 +287,7 @@ def widened(model: mujoco.MjModel, contact: float, limit: float) -> mujoco.MjMod
 
 def _widen(far: mujoco.MjModel, model: mujoco.MjModel, contact: float, limit: float) -> None:
     far.geom_margin[:] = model.geom_margin + contact / 2
+    far.body_margin[:] = model.body_margin + contact / 2  # else bodies of several geoms are searched as before
     far.flex_margin[:] = model.flex_margin + contact / 2
     far.pair_margin[:] = model.pair_margin + contact
     far.opt.o_margin = model.opt.o_margin + contact
