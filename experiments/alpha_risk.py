@@ -42,6 +42,7 @@ _RULES: dict[str, rules.Rule] = {
     ALPHA: rules.LeastRisk(),
 }
 METHODS = (FIRST_ORDER, ZEROTH_ORDER, *_RULES)
+_CONTACTS = {"discrete": mg.Discrete(), "slope": mg.Slope()}
 _PART = 256  # rollouts that are made at a time
 _RESAMPLES = 400
 
@@ -61,6 +62,8 @@ class Settings(OwnScene, RunSettings):
     """Steps of their descent by an unbiased estimate, after which they are measured once more."""
     walls: tuple[Positive, ...] = (1e2, 1e3, 1e4, 1e5)
     """Stiffness of the wall in a throw (1/s²)."""
+    throws: tuple[Positive, ...] = (0.5, 0.8, 0.95)
+    """Angles of throws (rad) whose contacts, MuJoCo's default ones, set in with a jump of force; by both derivatives."""
     robots: tuple[RobotName, ...] = ("hopper", "walker2d", "half_cheetah", "ant")
     """Of gymnasium, by C MuJoCo; their controls under noise, by both derivatives."""
     stddev: Positive = 0.3
@@ -83,6 +86,7 @@ class Cell:
         ratio: error of α-order over that of the better of first and zeroth order.
         ratio_interval: of 95 %, by resampling batches.
         alpha: mean weight of α-order.
+        bias: that of first order, over the norm of the truth, by all samples; zero where noise hides it.
         truth_error: squared error of the truth, over its squared norm; taken off from all errors.
     """
 
@@ -95,6 +99,7 @@ class Cell:
     ratio: float
     ratio_interval: tuple[float, float]
     alpha: float
+    bias: float
     truth_error: float
 
 
@@ -107,7 +112,7 @@ class Outcome:
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per cell, for metrics.csv."""
-        names = ("problem", "derivative", "dim", "batch", "ratio", "alpha", "truth_error")
+        names = ("problem", "derivative", "dim", "batch", "ratio", "alpha", "bias", "truth_error")
         return [
             {name: getattr(cell, name) for name in names}
             | {f"error, {name}": value for name, value in cell.error.items()}
@@ -148,12 +153,13 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 def _problems(settings: Settings) -> list[Callable[[], _Problem]]:
     if settings.scene is not None:
-        return [functools.partial(_own, settings, name) for name in ("discrete", "slope")]
+        return [functools.partial(_own, settings, name) for name in _CONTACTS]
     swept = {
         _closed_form: (settings.textbook, settings.points, settings.dims),
         _published: (settings.tasks, (0, settings.later)),
         _throw: (settings.walls,),
-        _robot: (settings.robots, ("discrete", "slope")),
+        _default_throw: (settings.throws, _CONTACTS),
+        _robot: (settings.robots, _CONTACTS),
     }
     return [functools.partial(make, settings, *each) for make, by in swept.items() for each in itertools.product(*by)]
 
@@ -188,11 +194,19 @@ def _published(settings: Settings, name: str, steps: int) -> _Problem:
 
 def _throw(settings: Settings, stiffness: float) -> _Problem:
     objective = mg.tasks.ball_wall().objective(softness=wall_softness(stiffness))
-    params = jnp.array([0.6])
+    return _thrown(settings, f"throw, wall of {stiffness:g} 1/s²", "discrete", objective, 0.6)
+
+
+def _default_throw(settings: Settings, angle: float, kind: str) -> _Problem:
+    softness = mg.Softness(stiffness=2500.0, damping_ratio=1.0, impedance=(0.9, 0.95), width=0.001)
+    objective = mg.tasks.ball_wall().with_contact(_CONTACTS[kind]).objective(0.05, softness)
+    return _thrown(settings, f"throw at {angle:g} rad, default contact", kind, objective, angle)
+
+
+def _thrown(settings: Settings, title: str, kind: str, objective: Objective, angle: float) -> _Problem:
+    params = jnp.array([angle])
     truth = functools.partial(_by_many, settings, objective, params, mg.estimators.control_variate)
-    return _Problem(
-        f"throw, wall of {stiffness:g} 1/s²", "discrete", objective, params, truth, settings.num_samples // 2
-    )
+    return _Problem(title, kind, objective, params, truth, settings.num_samples // 2)
 
 
 # Time steps of a rollout.
@@ -212,7 +226,7 @@ def _own(settings: Settings, kind: str) -> _Problem:
 
 
 def _of_task(settings: Settings, name: str, kind: str, task: mg.SceneTask) -> _Problem:
-    contact = {"discrete": mg.Discrete(), "slope": mg.Slope()}[kind]
+    contact = _CONTACTS[kind]
     model = task.scene.model
     middle = np.where(model.actuator_ctrllimited, np.mean(model.actuator_ctrlrange, axis=1), 0.0)
     width = settings.stddev * jnp.broadcast_to(jnp.asarray(half_range(task.scene)), (task.horizon, len(middle)))
@@ -249,7 +263,7 @@ def _cells(make: Callable[[], _Problem], settings: Settings, key: Array) -> list
             continue
         split = jax.tree.map(lambda leaf, n=count, m=size: leaf[: n * m].reshape(n, m, *leaf.shape[1:]), samples)
         values, alpha = _estimates(plan, split)
-        cells.append(_cell(problem, params.size, batch, jax.device_get(values), alpha, truth, truth_error))
+        cells.append(_cell(problem, batch, jax.device_get(values), alpha, truth, truth_error))
     return cells
 
 
@@ -266,8 +280,15 @@ def _estimates(plan: Plan, batches: Samples) -> tuple[dict[str, Float[Array, "ba
     return jax.lax.map(one, batches)
 
 
+def _bias(first: Float[np.ndarray, "batches dim"], truth: np.ndarray, truth_error: float) -> float:
+    """Return the norm of a mean's distance from the truth over that of the truth, without what noise adds to its square."""
+    noise = first.var(axis=0, ddof=1).sum() / len(first) + truth_error
+    square = np.sum((first.mean(axis=0) - truth) ** 2) - noise
+    return float(np.sqrt(max(square, 0) / max(np.sum(truth**2) - truth_error, 1e-300)))
+
+
 def _cell(
-    problem: _Problem, dim: int, batch: int, values: dict[str, Any], alpha: Any, truth: np.ndarray, truth_error: float
+    problem: _Problem, batch: int, values: dict[str, Any], alpha: Any, truth: np.ndarray, truth_error: float
 ) -> Cell:
     squares = {
         name: ((np.asarray(value, float) - truth) ** 2).sum(axis=1) - truth_error for name, value in values.items()
@@ -285,13 +306,14 @@ def _cell(
     return Cell(
         problem.name,
         problem.derivative,
-        dim,
+        truth.size,
         batch,
         {name: float(x.mean() / scale) for name, x in squares.items()},
         {name: float(x.std(ddof=1) / np.sqrt(number) / scale) for name, x in squares.items()},
         ratio(np.arange(number)),
         (float(low), float(high)),
         float(np.mean(alpha)),
+        _bias(np.asarray(values[FIRST_ORDER], float), truth, truth_error),
         truth_error / scale,
     )
 
@@ -344,7 +366,10 @@ def tables(outcome: Outcome) -> list[Table]:
             "numbers": str(cell.dim),
             "samples": str(cell.batch),
         }
-        row |= {name: quantity(cell.error[name]) for name in shown} | {"α": f"{cell.alpha:.2f}"}
+        row |= {name: quantity(cell.error[name]) for name in shown} | {
+            "bias of first order": percent(cell.bias),
+            "α": f"{cell.alpha:.2f}",
+        }
         ratio = (Bold if high < 0.9 else str)(f"{cell.ratio:.2f} ({low:.2f} to {high:.2f})")
         rows.append(row | {"α-order over the better part": ratio})
     caption = (

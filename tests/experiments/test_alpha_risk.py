@@ -48,6 +48,7 @@ def test_errors_of_a_step_are_those_of_its_closed_form(outcome):
     slope = norm.pdf(0)
     for cell in outcome.cells:
         assert cell.error[FIRST_ORDER] == pytest.approx(1, rel=1e-9)
+        assert cell.bias == pytest.approx(1, rel=1e-9)
         count = cell.batch
         exact = ((0.25 - slope**2) / count + (0.25 + slope**2) / (count * (count - 1))) / slope**2
         # One coordinate's noise comes on top of the jumps of all the others, of a quarter each.
@@ -70,6 +71,13 @@ def test_the_page_says_how_far_alpha_order_is_from_the_better_part(outcome):
     figure, _, caption = drawings(outcome)["risk"](outcome)
     assert len(figure.axes) == 2
     assert "near 1 or below" in caption
+
+
+def test_the_bias_is_what_noise_does_not_explain():
+    noise = np.random.default_rng(0).normal(size=(400, 3))
+    truth = np.array([3.0, 0.0, 4.0])
+    assert alpha_risk._bias(truth + 0.1 * noise, truth, 0.0) < 0.005
+    assert alpha_risk._bias(1.2 * truth + noise, truth, 0.0) == pytest.approx(0.2, abs=3 / np.sqrt(400) / 5)
 
 
 def test_a_cell_whose_truth_is_too_rough_is_not_counted(outcome):
