@@ -236,12 +236,7 @@ def _cells(cost: Cost) -> list[str]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures."""
-    return {"factors": factors}
-
-
-def factors(outcome: Outcome):
-    """Bars of time by scene and part, and marks of memory."""
+    """Draw bars of time by scene and part, and marks of memory."""
     scenes = list(dict.fromkeys(cost.scene for cost in outcome.costs))
     keys = {e: [k for k in PARTS if any((c.part, c.engine) == (k, e) for c in outcome.costs)] for e in _TITLES}
     heights = [len(keys[engine]) + 1 for engine in keys]
@@ -267,4 +262,4 @@ def factors(outcome: Outcome):
         "Factor by which time (bars) and memory (diamonds) grow when a part is put back that is left out, of a motion and of its "
         "gradient. At 1 a part costs nothing."
     )
-    return figure, "What each omission buys", caption
+    return {"factors": (figure, "What each omission buys", caption)}

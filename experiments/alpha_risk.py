@@ -380,12 +380,7 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures."""
-    return {"risk": risk}
-
-
-def risk(outcome: Outcome):
-    """Errors of all parts and of α-order over the better part's, sorted."""
+    """Draw errors of all parts and of α-order over the better part's, sorted."""
     figure, axes = subplots(1, len(outcome.settings.batches), height=4.6, sharey=True)
     looks = {
         FIRST_ORDER: {"color": FIRST, "marker": "o"},
@@ -411,4 +406,4 @@ def risk(outcome: Outcome):
         "Each column is one problem with one derivative: left, where first order is far ahead, right, where zeroth order is. "
         "α-order stays near 1 or below; each of the others is far above on one side."
     )
-    return figure, "Squared errors over those of the better part", caption
+    return {"risk": (figure, "Squared errors over those of the better part", caption)}

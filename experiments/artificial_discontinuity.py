@@ -244,12 +244,7 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    return {"outcomes": outcomes}
-
-
-def outcomes(outcome: Outcome):
-    """Outcomes by remedy, above; errors of gradients against changes of the outcome, below."""
+    """Draw outcomes by remedy, above; errors of gradients against changes of the outcome, below."""
     figure, axes = subplots(2, len(outcome.found), height=7.0)
     for (upper, lower), one, case in zip(axes.T, outcome.found, CASES, strict=False):
         colours = dict(
@@ -272,4 +267,4 @@ def outcomes(outcome: Outcome):
         "Above, outcomes against the parameter, as it is (thick) and with remedies; the band is the noise about the largest "
         "jump. Below, each remedy's error of the gradient against its change of the outcome; 10⁻³ stands for less."
     )
-    return figure, "Outcomes across discontinuities, and what remedies cost", caption
+    return {"outcomes": (figure, "Outcomes across discontinuities, and what remedies cost", caption)}

@@ -135,8 +135,8 @@ def loss(outcome: Outcome):
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figure."""
-    return {"loss": loss}
+    """Draw the figure."""
+    return {"loss": loss(outcome)}
 
 
 def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tuple[str | None, str]:

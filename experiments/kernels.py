@@ -162,11 +162,6 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figure."""
-    return {"kernels": kernels}
-
-
-def kernels(outcome: Outcome):
     """Draw forces near contact, slopes far from it, and where the rod ends."""
     figure, axes = subplots(1, 3, height=3.9)
     near, far, push = axes[0]
@@ -186,4 +181,4 @@ def kernels(outcome: Outcome):
         "Left, lines by the smoothed step, dots means of MuJoCo's force over samples of the density, at the same acceleration. "
         "Middle, what is left of the gradient of one step. Right, where a finger that does not touch a rod is planned to push it."
     )
-    return figure, "Force at a distance, its gradient, and a push that it finds", caption
+    return {"kernels": (figure, "Force at a distance, its gradient, and a push that it finds", caption)}

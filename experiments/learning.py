@@ -460,12 +460,12 @@ def _of_gradients(course: Course) -> tuple[str, str]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    found: dict[str, Any] = {"course": course_of_learning}
+    """Draw the figures in order of reading."""
+    found: dict[str, Any] = {"course": course_of_learning(outcome)}
     if len(outcome.settings.stiffness) > 1:
-        found["stiffness"] = by_stiffness
+        found["stiffness"] = by_stiffness(outcome)
     if any(course.method != "ppo" for course in outcome.courses):
-        found["variance"] = quality
+        found["variance"] = quality(outcome)
     return found
 
 

@@ -283,12 +283,7 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    return {"variance": variance}
-
-
-def variance(outcome: Outcome):
-    """Variances against the horizon with their crossings and α; errors by windows."""
+    """Draw variances against the horizon with their crossings and α; errors by windows."""
     figure, axes = subplots(2, len(outcome.found), height=6.8)
     looks = {FIRST_VARIANCE: (FIRST, "-"), ZEROTH_VARIANCE: (ZEROTH, "-"), SIZE: (REFERENCE, ":")}
     for (upper, lower), one in zip(axes.T, outcome.found, strict=True):
@@ -325,4 +320,4 @@ def variance(outcome: Outcome):
         "(dotted); dashed, where first order's passes zeroth order's, with its interval. At the foot, the mean α of α-order. "
         "Below, errors of 16 rollouts for the mean cost over the horizon, by windows; dotted, biases; blue, zeroth order."
     )
-    return figure, "Variance against the horizon, and what windows do", caption
+    return {"variance": (figure, "Variance against the horizon, and what windows do", caption)}

@@ -287,16 +287,11 @@ def tables(outcome: Outcome) -> list[Table]:
     ]
 
 
-def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    return {"depths": depths}
-
-
 _SHOWN = -1e3, 1e3  # m/m
 
 
-def depths(outcome: Outcome):
-    """Depths by offset, and derivatives by contact."""
+def drawings(outcome: Outcome) -> Drawings:
+    """Draw depths by offset, and derivatives by contact."""
     figure, ((left, right),) = subplots(1, 2, height=4.6)
     offsets = 1e3 * np.linspace(*OFFSETS, outcome.settings.num_points)
     for i, (x, shade) in enumerate(zip(outcome.told, shades(len(outcome.told)), strict=True)):
@@ -314,4 +309,4 @@ def depths(outcome: Outcome):
         "steepest place of each (dashes), their mean (dots), and the slope of the mean depth (diamonds); what lies beyond "
         "1000 is at the edge."
     )
-    return figure, "Depth of the peg by how contact is told, and its derivatives", caption
+    return {"depths": (figure, "Depth of the peg by how contact is told, and its derivatives", caption)}

@@ -236,8 +236,8 @@ _MOST_POSES = 9  # in a panel
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    return {"plane": plane, "cost": cost}
+    """Draw the figures in order of reading."""
+    return {"plane": plane(outcome), "cost": cost(outcome)}
 
 
 def cost(outcome: Outcome):

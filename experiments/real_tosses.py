@@ -426,8 +426,8 @@ _COLOURS: Mapping[str, str] = {"nominal": MUTED, "fitted by Acosta et al.": ZERO
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    return {"errors": held_out, "toss": one_toss}
+    """Draw the figures in order of reading."""
+    return {"errors": held_out(outcome), "toss": one_toss(outcome)}
 
 
 def held_out(outcome: Outcome):

@@ -276,9 +276,9 @@ def tables(outcome: Outcome) -> list[Table]:
     return [Table(("contestant", *names), short, caption, frozenset(places)), Table(columns.split(", "), rows, about)]
 
 
-def drawings(_: Outcome) -> Drawings:
-    """Name the figures."""
-    return {"error_against_time": error_against_time}
+def drawings(outcome: Outcome) -> Drawings:
+    """Draw the figure."""
+    return {"error_against_time": error_against_time(outcome)}
 
 
 def error_against_time(outcome: Outcome):

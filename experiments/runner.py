@@ -141,7 +141,7 @@ def _call(run: Run, workspace: Workspace) -> "Report":
         said: dict[str, Any] = {name: tell(outcome) for name in _SAID if callable(tell := getattr(words, name, None))}
         wanted = getattr(run.settings, "video", None)
         video, caption = pictures.video(outcome, workspace, wanted) if wanted else (None, "")
-        figures = save(pictures.drawings(outcome), outcome, workspace.folder)
+        figures = save(pictures.drawings(outcome), workspace.folder)
         report = Report(**said, figures=figures, metrics=outcome.rows(), video=video, video_caption=caption)
     # A scene warns of some of it when it is loaded.
     return replace(report, warnings=merged([*report.warnings, *workspace.told, *workspace.warnings]))

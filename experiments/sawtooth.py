@@ -459,15 +459,15 @@ _NAMES = {
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name a figure per motion, at its longest time step."""
+    """Draw a figure per motion, at its longest time step."""
     longest: dict[str, xr.Dataset] = {}
     for course in outcome.courses:
         longest.setdefault(str(course.case.values), course)
     named = enumerate(longest.items())
-    return {f"teeth_{name}": functools.partial(_teeth, course, k == 0) for k, (name, course) in named}
+    return {f"teeth_{name}": _teeth(course, is_first=k == 0) for k, (name, course) in named}
 
 
-def _teeth(course: xr.Dataset, is_first: bool, _: Outcome):
+def _teeth(course: xr.Dataset, *, is_first: bool):
     """Draw the outcome less its trend and single derivatives over the start, and their mean over time."""
     figure, axes = subplots(3, course.coordinate.size, height=7.4)
     for column, label in zip(axes.T, course.coordinate.values, strict=True):

@@ -280,9 +280,9 @@ def _crossing(outcome: Outcome) -> str | None:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    found: dict[str, Any] = {} if outcome.by_stiffness is None else {"stiffness": stiffness}
-    return found | {"samples": samples, "problem": problem}
+    """Draw the figures in order of reading."""
+    found = {} if outcome.by_stiffness is None else {"stiffness": stiffness(outcome)}
+    return found | {"samples": samples(outcome), "problem": problem(outcome)}
 
 
 def stiffness_name(outcome: Outcome) -> str:

@@ -1,7 +1,7 @@
 """How the figures look: one type size, few lines, colours that colour-blind readers can tell apart."""
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +43,8 @@ OTHERS = (ONSET, DEFAULT, "#e69f00", "#56b4e9", "#8c6d31", "#6b6ecf", MUTED, "#3
 MARKERS = "osD^vP*X<>"
 WIDTH = 11.0  # inches, of a page
 
-# By the name of the file: the picture of an outcome, its title of a few words, and what it shows and how to read it.
-Drawings = Mapping[str, Callable[[Any], tuple[Picture, str, str]]]
+# By the name of the file: a picture, its title of a few words, and what it shows and how to read it.
+Drawings = Mapping[str, tuple[Picture, str, str]]
 
 
 def subplots(rows: int, columns: int, *, height: float, **settings):
@@ -60,12 +60,11 @@ def panel(height: float) -> tuple[Picture, Axes]:
     return figure, axes[0, 0]
 
 
-def save(drawings: Drawings, outcome: Any, folder: Path) -> list[Figure]:
-    """Draw the figures of a report into a run's folder, and let go of them."""
+def save(drawings: Drawings, folder: Path) -> list[Figure]:
+    """Write the figures of a report into a run's folder, and let go of them."""
     (folder / "figures").mkdir(exist_ok=True)
     figures = []
-    for name, drawing in drawings.items():
-        picture, title, caption = drawing(outcome)
+    for name, (picture, title, caption) in drawings.items():
         file = f"figures/{name}.svg"
         (folder / file).write_text(svg(lambda picture=picture: picture, title), encoding="utf-8")
         figures.append(Figure(file, title, caption))

@@ -234,11 +234,6 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
-    return {"tree": figure}
-
-
-def figure(outcome: Outcome):
     """Draw the distance from the goal against nodes, and one tree."""
     picture, axes = subplots(1, 2, height=4.6)
     left, right = axes[0]
@@ -263,7 +258,7 @@ def figure(outcome: Outcome):
         "Left, one curve per seed; a dot is a goal that was reached, a cross one that was not. Right, the nodes of the "
         f"smoothed tree of seed {shown.seed}, and its path from the square to the goal before it is polished."
     )
-    return picture, "How trees reach the goal", caption
+    return {"tree": (picture, "How trees reach the goal", caption)}
 
 
 def _shown(outcome: Outcome) -> Attempt:

@@ -166,9 +166,9 @@ def _own(outcome: Outcome) -> str:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
+    """Draw the figures in order of reading."""
     every = {"landscape": landscape, "gradient": gradient, "bias_variance": bias_variance, "choice": choice}
-    return {name: every[name] for name in _words(outcome).drawings}
+    return {name: every[name](outcome) for name in _words(outcome).drawings}
 
 
 def landscape(outcome: Outcome):

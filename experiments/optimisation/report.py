@@ -154,9 +154,10 @@ _DARK = ("inconsistent", "not_finite", "nothing_felt")
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name the figures in order of reading."""
+    """Draw the figures in order of reading."""
+    found = {"final": final(outcome), "curves": curves(outcome)}
     has_alpha = any(run.reasons for run in outcome.runs)
-    return {"final": final, "curves": curves} | ({"alpha": alpha} if has_alpha else {})
+    return found | ({"alpha": alpha(outcome)} if has_alpha else {})
 
 
 def final(outcome: Outcome):

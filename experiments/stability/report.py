@@ -1,6 +1,5 @@
 """The answer of an experiment on stability, computed from its numbers, and its pictures."""
 
-import functools
 import re
 from collections import Counter
 
@@ -176,10 +175,10 @@ _DERIVATIVES = ("#66c2a5", "#e8eaed", "#a6341b", "#8c6d31", "#7f3c8d", "#22262e"
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name a figure of all scenes, and one per kind of scene, the planes of its first scene."""
+    """Draw a figure of all scenes, and one per kind of scene, the planes of its first scene."""
     shown = {one.scene.family if one.scene.has_refsafe else one.scene.name: one for one in reversed(outcome.scenes)}
-    planes = {re.sub(r"\W", "_", one.scene.name): functools.partial(_planes, one) for one in reversed(shown.values())}
-    return {"all_scenes": _all_scenes} | planes
+    planes = {re.sub(r"\W", "_", one.scene.name): _planes(one, outcome) for one in reversed(shown.values())}
+    return {"all_scenes": _all_scenes(outcome)} | planes
 
 
 def _all_scenes(outcome: Outcome) -> tuple[Picture, str, str]:

@@ -1,6 +1,5 @@
 """The answer of an experiment on error against run time: words, a table, a picture per scene."""
 
-import functools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -183,8 +182,8 @@ _SMALLEST, _LARGEST = 1e-9, 10.0
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Name a figure of all scenes, and one per scene."""
-    return {"all_scenes": _all_scenes} | {course.name: functools.partial(_drawn, course) for course in outcome.courses}
+    """Draw a figure of all scenes, and one per scene."""
+    return {"all_scenes": _all_scenes(outcome)} | {course.name: _drawn(course, outcome) for course in outcome.courses}
 
 
 def _all_scenes(outcome: Outcome):

@@ -94,5 +94,5 @@ def test_the_page_names_the_largest_factors_and_what_hurts():
 
 
 def test_the_figure_has_a_panel_for_each_scene_and_engine():
-    figure, _, _ = drawings(_outcome())["factors"](_outcome())
+    figure, _, _ = drawings(_outcome())["factors"]
     assert len(figure.axes) == 2

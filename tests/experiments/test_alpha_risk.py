@@ -68,7 +68,7 @@ def test_the_page_says_how_far_alpha_order_is_from_the_better_part(outcome):
         assert cell.ratio == pytest.approx(
             cell.error[ALPHA] / min(cell.error[FIRST_ORDER], cell.error[ZEROTH_ORDER]), rel=1e-9
         )
-    figure, _, caption = drawings(outcome)["risk"](outcome)
+    figure, _, caption = drawings(outcome)["risk"]
     assert len(figure.axes) == 2
     assert "near 1 or below" in caption
 

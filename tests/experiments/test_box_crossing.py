@@ -72,5 +72,5 @@ def test_who_reaches_the_loss_is_told_by_seconds_and_not_after_the_time_is_over(
     assert answer(outcome).startswith("B: 2.0 s at worst")
     assert verdict(outcome).endswith("from every start: “a” (3.0 s) and “b” (2.0 s).")
     assert [row[1] for row in tables(outcome)[0].rows[:3]] == ["3", "2", "–"]
-    assert len(save(drawings(outcome), outcome, tmp_path)) == 1
+    assert len(save(drawings(outcome), tmp_path)) == 1
     assert len(outcome.rows()) == 8

@@ -37,7 +37,7 @@ def test_the_answer_tells_agreement_and_from_where_pushes_are_found(tmp_path):
     assert answer(outcome(6.0)).startswith("Samples disagree")
     assert "within 1.5 standard errors" in verdict(found)
     assert len(tables(found)[0].rows) == 3
-    assert len(save(drawings(found), found, tmp_path)) == 1
+    assert len(save(drawings(found), tmp_path)) == 1
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def test_the_report_says_who_arrives_and_who_does_not_move(tmp_path):
     assert "reaches its goal to 1.0 mm and 0.000 rad; with no smoothing the rod does not move" in verdict(found)
     assert answer(found) == "Yes, with smoothed models; no, with plain ones."
     assert tables(found)[0].rows[0][1:5] == ["yes", "1.0 mm", "0.000 rad", "1 of 2"]
-    assert len(save(drawings(found), found, tmp_path)) == 2
+    assert len(save(drawings(found), tmp_path)) == 2
 
 
 @pytest.mark.slow

@@ -175,7 +175,7 @@ def test_the_page_names_the_fastest_of_those_that_are_right(cells):
     short, every = tables(outcome)
     assert len(every.rows) == len(outcome.rows()) == len(entries)
     assert short.emphasised == {(0, 1), (1, 1), (4, 1)}
-    figure, _, _ = drawings(outcome)["error_against_time"](outcome)
+    figure, _, _ = drawings(outcome)["error_against_time"]
     assert sum(axis.axison for axis in figure.axes) == 2
 
 

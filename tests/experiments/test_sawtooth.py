@@ -62,7 +62,7 @@ def test_the_error_beside_the_converged_motion_is_that_of_each_arm():
 
 def test_every_motion_gets_its_figure(tmp_path):
     outcome = Outcome([_course(0.05)])
-    figures = save(drawings(outcome), outcome, tmp_path)
+    figures = save(drawings(outcome), tmp_path)
     assert [figure.file for figure in figures] == ["figures/teeth_ball.svg"]
     assert all((tmp_path / figure.file).is_file() for figure in figures)
     assert len(outcome.rows()) == 5 * 2

@@ -133,7 +133,7 @@ def test_a_square_is_pale_where_the_motion_is_as_in_c_mujoco_and_an_axis_has_thr
     theirs = [Motion.MOVES_ON] * len(grid)
     one = _outcome("ball", grid, [Motion.TUNNELS, *theirs[1:]], theirs, np.zeros(len(grid)))
     found = Outcome(load_runs("stability", ['precisions=["float64"]'])[0].settings, [one])
-    picture, *_ = drawings(found)["ball"](found)
+    picture, *_ = drawings(found)["ball"]
     in_c, in_mjxgrad, slope = (axis.images[0].get_array()[..., 3] for axis in picture.axes[:3])
     assert (in_c == 1).all()
     assert (slope == 1).all()

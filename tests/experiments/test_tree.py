@@ -41,7 +41,7 @@ def test_the_report_counts_replays_that_end_at_the_goal(tmp_path):
     assert "Smoothed tree turns the body from 1 of 2 seeds after 4 nodes and 2.0 s to 3° (medians)." in verdict(found)
     assert "Unsmoothed tree turns the body from no seed." in verdict(found)
     assert len(tables(found)[0].rows) == 4
-    assert len(save(drawings(found), found, tmp_path)) == 1
+    assert len(save(drawings(found), tmp_path)) == 1
 
 
 def test_a_replay_is_the_motion_that_the_tree_saw():

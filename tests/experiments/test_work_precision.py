@@ -83,7 +83,7 @@ def test_a_scene_on_which_everything_diverges_is_drawn_and_gets_no_recommendatio
     points = (point(1e-3, np.inf, 4.0), point(2e-3, np.inf, 2.0))
     course = Course("x", "X", 2e-3, points, references, (lost,), 0.01, compiling)
     outcome = Outcome(load_runs("work_precision", [])[0].settings, (course,))
-    assert len(save(report.drawings(outcome), outcome, tmp_path)) == 2
+    assert len(save(report.drawings(outcome), tmp_path)) == 2
     ((_, known_to, _, motion, costs, gradient, *_),) = report.tables(outcome)[0].rows
     assert (known_to, motion, costs, gradient) == ("0.01%", "–", "–; –; –", "–")
 
