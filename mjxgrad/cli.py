@@ -5,8 +5,10 @@ import functools
 import importlib
 import importlib.util
 import os
+import select
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +24,9 @@ except ImportError:
 
 Switch = Annotated[bool, cyclopts.Parameter(negative="")]
 Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
+
+
+_GRACE = 0.7  # s, for the main thread to hear of a signal
 
 
 class CommandError(Exception):
@@ -43,32 +48,55 @@ def main(arguments: list[str] | None = None) -> int:
     interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
     interruptions: list[int] = []
+    began, ends = os.pipe()
+    os.set_blocking(ends, False)
 
     def interrupt(*given: Any) -> None:
         interruptions.append(given[0])
-        os.write(2, b"interrupted: what has begun is completed first\n")  # may take long
         signal.default_int_handler(*given)
 
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
+    signal.set_wakeup_fd(ends, warn_on_full_buffer=False)
+    # A search for parameters may have found some while it is within XLA.
+    grace = _GRACE if "identify" not in (arguments or sys.argv) else 60 * _GRACE
+    threading.Thread(target=_watch, args=(began, interruptions, grace), daemon=True).start()
+    status = 2
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
         if interruptions:  # the library has returned what was measured
             raise KeyboardInterrupt
-        return status
     except KeyboardInterrupt:
         _say("interrupted")
-        return 130
+        status = 130
+        if arguments is None:  # as a command: nobody waits for work in other threads
+            sys.stdout.flush()
+            os._exit(status)
     except BrokenPipeError:  # the reader has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        status = 0
     except cyclopts.CycloptsError as error:
         command = " ".join(["mjxgrad", *(error.command_chain or ())])
         _say(f"{str(error).rstrip('.')}; {command} --help lists what there is")
     # The library refuses by these errors, in a sentence; any other error is a bug.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
-    return 2
+    finally:
+        signal.set_wakeup_fd(-1)
+        os.close(ends)
+    return status
+
+
+def _watch(pipe: int, heard: list[int], grace: float) -> None:
+    """End the process at a second signal, or where the first finds the main thread within XLA, with nothing measured yet."""
+    if os.read(pipe, 1):
+        os.write(2, b"interrupted: writing what there is; once more ends at once\n")
+        if select.select([pipe], [], [], grace)[0] or heard:
+            heard = heard if os.read(pipe, 1) == b"" else []
+        if not heard:
+            os.write(2, b"interrupted\n")
+            os._exit(130)
+    os.close(pipe)
 
 
 def _say(text: str) -> None:
@@ -104,7 +132,11 @@ def check(
         seed: seed of all random numbers.
     """
     _writable(html, is_page=True)
-    mg, log = _library(), _timed()
+    log = _timed()
+    log(
+        f"takes up to {10 if quick else budget + 10:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends with what there is"
+    )
+    mg = _library()
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)
     if html is not None:
@@ -135,7 +167,7 @@ def sweep(
         cost: file.py:function or module:function, from a trajectory to its cost, such as `def cost(course): return
             course.qpos[-1, 0]`; or at the end height:body, speed:body, upright:body, reach:body/site; by default a random
             mix of the heaviest body's final coordinates.
-        start: a key frame by name, with its controls, about which the noise is; by default the reference pose.
+        start: a key frame by name, with its controls, about which the noise is; by default the first, else the reference pose.
         horizon: number of time steps; by default half a second, but 50 to 300 steps.
         stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
@@ -146,7 +178,8 @@ def sweep(
         html: the page to write.
     """
     _writable(html, is_page=True)
-    mg, log = _library(), _timed()
+    log = _timed()
+    mg = _library()
     given = {} if stiffness is None else {"stiffness": stiffness}
     given |= {"noise": noise, "num_samples": samples, "num_reference": 16 * samples, "seed": seed, "log": log}
     given |= {"start": start, "horizon": horizon, "contact": mg.stepping.own_motion(gradient), "engine": engine}

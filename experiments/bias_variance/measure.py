@@ -91,9 +91,9 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
                 num_reference=settings.reference_samples,
                 confidence=settings.confidence,
                 compiler_options=compiler_options() if settings.problem == "own" else None,
-                progress=lambda done, _: advance_to(done),
+                progress=lambda done, total: advance_to(done * len(stiffness) // total),
             )
-            if len(found.cost) < len(stiffness):
+            if found.share < 1:
                 raise KeyboardInterrupt
             return found
 

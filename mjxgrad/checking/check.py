@@ -10,8 +10,10 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -22,8 +24,16 @@ from mjxgrad.batched import device
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Line, Measured, Noise, measure
-from mjxgrad.checking.motions import Motions, Mover, Outcomes, half_range, most_contacts, random_motions
+from mjxgrad.checking.measure import Line, Measured, Noise, measure, slopes
+from mjxgrad.checking.motions import (
+    Motions,
+    Mover,
+    Outcomes,
+    half_range,
+    most_contacts,
+    random_motions,
+    seconds_of,
+)
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.engines import QUICK
 from mjxgrad.objective.task import as_pytree, checked_cost
@@ -31,8 +41,8 @@ from mjxgrad.report import INK, Block, page, svg
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
-_SMALL = 12  # degrees of freedom up to which a batch has the first of these numbers of motions, else the second
-_BATCHES = (64, 32)
+_Function = TypeVar("_Function", bound=Callable)
+_BATCH = 64  # motions along a line, or under noise
 _MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
@@ -47,7 +57,7 @@ class Verdict(Paged):
 
     Attributes:
         name: name of the scene.
-        headline: the answer, in at most 15 words.
+        headline: the answer, in at most 25 words.
         findings: faults first, then measurements left out for lack of time.
         recommendation: recommended settings.
         code: the recommended settings as code to paste.
@@ -86,11 +96,11 @@ class Verdict(Paged):
 
     def _details(self) -> dict[str, str]:
         """Return the detailed report: measurements, scene, time step."""
-        lines = ["Nothing."]
-        if self.measured:
-            lines = [f"Outcomes: {'; '.join(self.outcomes)}.", *map(_noise_text, self.measured.noises)]
-        scene, steps = self.scene.summary(), self.stability.summary()
-        return {"What was measured": "\n".join(lines), "The scene": scene, "Time step and contacts": steps}
+        found = {"The scene": self.scene.summary(), "Time step and contacts": self.stability.summary()}
+        if not (self.measured and self.measured.lines):
+            return found
+        lines = [f"Outcomes: {'; '.join(self.outcomes)}.", *map(_noise_text, self.measured.noises)]
+        return {"What was measured": "\n".join(lines), **found}
 
     def as_html(self) -> str:
         """Return the verdict as a self-contained page; needs `mjxgrad[render]`."""
@@ -102,6 +112,22 @@ class Verdict(Paged):
         return page(self.headline, f"mjxgrad check {self.name}", blocks)
 
 
+def in_double(call: _Function) -> _Function:
+    """Have a function compute in double precision, which at an exact touch decides as C MuJoCo does, and sees jumps."""
+
+    @functools.wraps(call)
+    def doubled(source: Source, *args: Any, **kwargs: Any) -> Any:
+        with jax.enable_x64(True):
+            if isinstance(source, Scene) and source.data.qpos.dtype == jnp.float32:
+                is_single = lambda x: getattr(x, "dtype", None) == jnp.float32  # noqa: E731
+                source = jax.tree.map(lambda x: jnp.asarray(x, float) if is_single(x) else x, source)
+                source = eqx.tree_at(lambda scene: scene.data.qpos, source, jnp.asarray(source.mj_model.qpos0))
+            return call(source, *args, **kwargs)
+
+    return doubled  # pyright: ignore[reportReturnType]
+
+
+@in_double
 def check(
     source: Source,
     cost: str | Cost | None = None,
@@ -146,7 +172,9 @@ def check(
     rng = np.random.default_rng(whole("seed", seed, 0))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scene = source if isinstance(source, Scene) else load_scene(source)
+        # By C MuJoCo, as is measured and advised: what MJX would do otherwise is asked for by `mjx`.
+        engine = QUICK if device.is_cpu() and not mjx else None
+        scene = source if isinstance(source, Scene) else load_scene(source, engine=engine)
         outcome = named_cost(scene, cost) if isinstance(cost, str) else as_pytree(cost)
         started = time.perf_counter()
         motions = random_motions(scene, rng)
@@ -157,16 +185,15 @@ def check(
     names, outcomes = _outcomes(scene, outcome, rng)
     if cost is not None and (motions.bad_steps < 0).any():
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
-    first = lambda one: say(f"- First verdict. {findings.slope_finding(findings.slopes(one)).text}")  # noqa: E731
-    measured, price = None, 0.0  # of a slope of one step, in s
+    first = lambda one: say(f"- First verdict. {findings.slope_finding(slopes(one.lines)).text}")  # noqa: E731
+    measured, prices = None, {}
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
-        mover = Mover(scene, _BATCHES[scene.model.nv > _SMALL], outcomes, started + budget)
+        mover = Mover(scene, _BATCH, outcomes, started + budget)
         with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(
                 scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say, first=first
             )
-        price = mover.step_seconds / mover.size
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
     if mjx and (motions.bad_steps < 0).any():
@@ -176,13 +203,16 @@ def check(
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
     advice = findings.recommend(motions, stability, measured, slots)
-    if price:
-        told = f"A slope over the {advice.horizon} steps of the program below takes {price * advice.horizon:.2g} s here"
-        found.append(Finding("note", f"{told}, by C MuJoCo in a batch."))
+    told = slopes(measured.lines) if measured else ()
+    if scene.model.nu and (motions.bad_steps < 0).any():
+        with contextlib.suppress(KeyboardInterrupt):
+            prices = seconds_of(scene, advice.horizon)
+            advice = findings.recommend(motions, stability, measured, slots, prices["slope"] / prices["discrete"])
+            found.append(findings.price_finding(prices, told, advice.horizon))
     path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,
-        headline=findings.headline(found, advice, motions),
+        headline=findings.headline(found, advice, motions, told, prices),
         findings=tuple(sorted(found, key=lambda one: (not one.is_fault, one.kind not in ("not_measured", "left_out")))),
         recommendation=advice,
         code=_code(scene, advice, path),
@@ -267,6 +297,12 @@ def _keyframe(scene: Scene) -> str:
     return f", keyframe={model.key(0).name or 0!r}" if model.nkey else ""
 
 
+def _home(scene: Scene) -> str:
+    """Return the controls about which a program begins: the key frame's."""
+    model = scene.mj_model
+    return f"scene.mj_model.key({model.key(0).name or 0!r}).ctrl" if model.nkey else "jnp.zeros(scene.model.nu)"
+
+
 def _code(scene: Scene, advice: Recommendation, path: str) -> str:
     """Return the recommendation as a program."""
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
@@ -278,7 +314,7 @@ def _code(scene: Scene, advice: Recommendation, path: str) -> str:
     return f"""\
 {_setup(scene, advice, path)}\
 objective = {objective}
-params = jnp.zeros(objective.dim)
+params = {f"jnp.tile({_home(scene)}, task.horizon)" if scene.model.nu else "jnp.zeros(objective.dim)"}
 estimate = mg.estimators.{advice.estimator}(objective, params, jax.random.key(0), num_samples=32)
 """
 
@@ -297,9 +333,11 @@ import functools
 
 {_setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, more)}
 low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
+home = {_home(verdict.scene)}
 
 
-def controls(knots):  # between −1 and 1, held for {held} time steps each, to the actuators' ranges
+def controls(knots):  # held for {held} time steps each, within the actuators' ranges; those at home where a knot is zero
+    knots = knots + jnp.arctanh(jnp.clip((2 * home - low - high) / (high - low), -0.95, 0.95))
     return jnp.repeat((low + high) / 2 + (high - low) / 2 * jnp.tanh(knots), {held}, axis=0)[: task.horizon]
 
 

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxgrad._text import format_number, name_pairs
-from mjxgrad.checking.measure import STDDEVS, Measured
+from mjxgrad.checking.measure import STDDEVS, Measured, Slope, nearest, slopes
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.engines import ENGINES
@@ -26,9 +26,8 @@ Kind = Literal[
 _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
-_CLEAR, _SCATTERED = 0.1, 0.25  # largest relative errors of a usable slope and a usable mean
-_CLOSE = 0.05  # largest typical error of a derivative that counts as the slope
-_FEWEST_TEETH = 4
+_OFF = 0.25  # expected error of a derivative from which it is a fault
+_CLEAR = 0.1  # largest relative error of a usable slope
 _DISAGREES = 0.1  # relative difference beyond which the slopes at two time steps disagree
 
 
@@ -44,16 +43,6 @@ class Finding:
 def chosen(gradient: str) -> str:
     """Return a gradient as an argument."""
     return f"contact=mg.{gradient.title()}()"
-
-
-@dataclass(frozen=True)
-class Slope:
-    """Readings of one kind of derivative: how many are off the slope or too scattered, and the median relative error."""
-
-    kind: str
-    num_off: int
-    num_readings: int
-    error: float
 
 
 @dataclass(frozen=True)
@@ -91,9 +80,19 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
         text = f"From {bad[0]} the motion is not finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
         yield Finding("not_finite", text, True)
     yield from _contact_findings(scene, motions)
+    if motions.exact:
+        yield Finding("note", exact_text(motions.exact))
     if motions.idle:
         text = f"No effect: {', '.join(motions.idle)}. A change of the control changes no position."
         yield Finding("no_effect", text, True)
+
+
+def exact_text(pairs: Sequence[str]) -> str:
+    """Say what is open where geoms touch exactly, and who decides."""
+    return (
+        f"{name_pairs(pairs)} touches exactly at the start, within rounding: single precision by MJX may begin without that "
+        "contact, which double precision has, here and by C MuJoCo. Begin a hair deeper or higher, 1e-5 m."
+    )
 
 
 def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
@@ -177,7 +176,7 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
         until = min(one.crossover for one in scattered)
         text = f"Derivatives of single motions scatter more than zeroth order from {until:.2g} s on."
         yield Finding("explodes", text + " Shorten the horizon or soften the contact.", True)
-    yield slope_finding(slopes(measured))
+    yield slope_finding(slopes(measured.lines))
     yield from _time_step_findings(measured)
     yield from _order_findings(measured)
 
@@ -193,18 +192,33 @@ def left_out_findings(measured: Measured | None, budget: int | float) -> Iterato
 
 
 def slope_finding(found: Sequence[Slope]) -> Finding:
-    """Return how far each derivative is from the slope; a fault where all are off."""
-    if not found[-1].num_readings:
+    """Return how far each derivative is from the slope, and which is nearer how often; a fault where both are far."""
+    slope, discrete = found
+    if not (count := slope.errors.size):
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
-    read = [one for one in found if one.num_readings]
-    parts = [f"{chosen(one.kind)}: {percent(one.error)}, {one.num_readings - one.num_off} right." for one in read]
-    lead = f"How far the mean derivative by C MuJoCo is from the slope, typical of {found[-1].num_readings} readings."
-    return Finding("slope", f"{lead} {' '.join(parts)}", is_fault=_is_mostly_off(found))
+    far, errors = _is_far(found), [percent(one.error) for one in found]
+    lead = f"Expected error beside the slope of the outcome, over {count} readings by {slope.num_motions} motions each"
+    both = f"{chosen('slope')} {errors[0]}, {chosen('discrete')} {errors[1]}"
+    nearer, alike = (slope.errors < discrete.errors).sum(), (slope.errors == discrete.errors).sum()
+    text = f"{lead}: {both}. The slope is nearer in {nearer}" + f" and as near in {alike}" * bool(alike)
+    return Finding("slope", f"{text}.", is_fault=far)
 
 
-def _is_mostly_off(found: Sequence[Slope]) -> bool:
-    """Return whether each kind of derivative is off at more than half of the readings."""
-    return all(2 * one.num_off > one.num_readings for one in found)
+def price_finding(prices: Mapping[str, float], found: Sequence[Slope], horizon: int) -> Finding:
+    """Return what a gradient costs, and whether the slope is worth its price."""
+    slope, discrete = (prices[kind] for kind in ("slope", "discrete"))
+    text = (
+        f"The gradient of a motion of {horizon} steps takes {slope:.2g} s by {chosen('slope')} and {discrete:.2g} s by "
+        f"{chosen('discrete')}, by C MuJoCo in a batch on all cores"
+    )
+    if found and found[0].errors.size and slope > discrete and nearest(found, slope / discrete) == "discrete":
+        text += f". The slope costs {slope / discrete:.2g} times as much and is no nearer beyond doubt"
+    return Finding("note", f"{text}.")
+
+
+def _is_far(found: Sequence[Slope]) -> bool:
+    """Return whether each kind of derivative is far from the slope."""
+    return all(one.error > _OFF for one in found)
 
 
 def _time_step_findings(measured: Measured) -> Iterator[Finding]:
@@ -239,47 +253,22 @@ def _order_findings(measured: Measured) -> Iterator[Finding]:
         yield Finding("order", text)
 
 
-def slopes(measured: Measured) -> tuple[Slope, ...]:
-    """Count over all lines, times and outcomes with a clear slope how often each derivative is off."""
-    found = []
-    for kind in ("slope", "discrete"):
-        off, errors = [], []
-        for line in measured.lines:
-            comparison = line.plain
-            at = comparison.gradients.index(kind)
-            # An outcome with hardly a tooth has the slope of that tooth: then only the slope at the shorter step counts.
-            is_told = comparison.num_teeth >= _FEWEST_TEETH
-            truths = [line.fine.slope, np.where(is_told, comparison.slope, line.fine.slope)]
-            spread = np.where(is_told, np.maximum(comparison.slope_error, line.fine.slope_error), line.fine.slope_error)
-            size = np.abs(line.fine.slope)
-            is_clear = (size > line.fine.resolution) & (spread <= np.maximum(_CLEAR * size, line.fine.resolution))
-            mean, error = comparison.mean[at], comparison.mean_error[at]
-            off_by = np.maximum(0.0, np.maximum(np.min(truths, axis=0) - mean, mean - np.max(truths, axis=0)))
-            size = np.maximum(size, line.fine.resolution)
-            is_scattered = error > _SCATTERED * size
-            # A precise derivative must not fail for a visible error of one percent.
-            is_far = (off_by > 2 * np.hypot(error, spread)) & (off_by > _CLOSE * size)
-            off += (is_far | is_scattered)[is_clear].tolist()
-            errors += (off_by / size)[is_clear].tolist()
-        found.append(Slope(kind, sum(off), len(off), float(np.median(errors)) if errors else math.nan))
-    return tuple(found)
-
-
 def recommend(
-    motions: Motions, stability: StabilityReport, measured: Measured | None, max_contacts: int | None
+    motions: Motions,
+    stability: StabilityReport,
+    measured: Measured | None,
+    max_contacts: int | None,
+    price: int | float = math.inf,
 ) -> Recommendation:
-    """Return the recommended settings from measurements; without measurements, safe ones."""
+    """Return the recommended settings from measurements and the price of a slope in that of a discrete derivative."""
     needed = [_largest_step(spring) for spring in _steps_too_long(stability)]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
         return Recommendation("slope", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
-    slope, discrete = found = slopes(measured)
-    # Where both are the slope, MuJoCo's own derivative is cheaper and more common.
-    is_exact = discrete.num_readings > 0 and discrete.num_off == 0 and discrete.error <= _CLOSE
-    is_better = discrete.num_readings > 0 and discrete.num_off < slope.num_off
+    found = slopes(measured.lines)
     touches = bool(motions.touches or motions.touching)
-    best = discrete if not touches or is_exact or is_better else slope
+    best = nearest(found, price) if touches else "discrete"
     has_jumps = any(line.changed for line in measured.lines)
     stddev = STDDEVS[-1] if has_jumps else STDDEVS[0]
     own = [noise for noise in measured.noises if noise.stiffness is None and noise.stddev == stddev]
@@ -290,10 +279,10 @@ def recommend(
     is_limited = limit < measured.times[-1]
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
-        gradient=best.kind,
-        estimator="alpha_order" if has_jumps or is_limited or not own or _is_mostly_off(found) else "first_order",
+        gradient=best,
+        estimator="alpha_order" if has_jumps or is_limited or not own or _is_far(found) else "first_order",
         stddev=stddev,
-        horizon=max(10, int(min(limit, measured.times[-1]) / motions.timestep)),
+        horizon=max(10, round(min(limit, measured.times[-1]) / motions.timestep)),
         timestep=timestep,
         stiffness=softer[0].stiffness if is_helped else None,
         max_contacts=max_contacts,
@@ -324,11 +313,23 @@ def _time_step(spring: Spring) -> str:
     return f"{what}: at {spring.speed:.2g} m/s it passes through. Take less than {needed} ms."
 
 
-def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motions) -> str:
-    """Return the answer in at most 15 words."""
+def headline(
+    findings: Sequence[Finding],
+    advice: Recommendation,
+    motions: Motions,
+    found: Sequence[Slope],
+    prices: Mapping[str, float],
+) -> str:
+    """Return the answer in at most 25 words: what to take, how sure, what it costs, and the worst fault."""
+    sure = "an unmeasured choice"
+    for one in found:
+        if one.kind == advice.gradient and one.errors.size:
+            sure = f"{percent(one.error)} off by {one.errors.size} readings"
+    if not (motions.touches or motions.touching):
+        sure = "without contact, exact"
+    cost = f"; {prices[advice.gradient]:.2g} s a gradient" if prices else ""
     ahead = f"{advice.horizon * motions.timestep:.2g} s ahead"
-    answer = f"{chosen(advice.gradient)} and {advice.estimator}, {ahead}"
-    minded = [finding.kind for finding in findings if finding.is_fault or finding.kind == "not_measured"]
+    minded = [finding.kind for finding in findings if finding.is_fault]
     words = {
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
@@ -338,12 +339,11 @@ def headline(findings: Sequence[Finding], advice: Recommendation, motions: Motio
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",
         "explodes": "the derivative explodes",
-        "slope": "most derivatives are not the slope",
+        "slope": "no derivative is the slope",
         "many_pairs": "too many pairs can touch",
-        "not_measured": "derivatives were not measured",
     }
-    found = next((words[kind] for kind in words if kind in minded), None)
-    return f"Differentiate it with {answer}." if found is None else f"Mind that {found}. Then {answer}."
+    worst = next((f" Mind that {words[kind]}." for kind in words if kind in minded), "")
+    return f"Take {chosen(advice.gradient)} and {advice.estimator}, {ahead}: {sure}{cost}.{worst}"
 
 
 def percent(share: float) -> str:

@@ -1,5 +1,6 @@
 """Measurements of a scene's derivatives, along lines and under noise, by the library's diagnostics."""
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
@@ -40,10 +41,18 @@ SOFTER = 0.1
 """Softer stiffness to compare with the file's, as a share of it."""
 _NUM_LINES, _NUM_TIMES = 3, 4
 _BEFORE, _AFTER = 30, 40  # steps around the first touch
-_FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 4
-_NUM_BATCHES = 10.0  # approximate number of batches in all
-_LINE_BATCHES, _NOISE_BATCHES = 2, 1
+_FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 8
+_NUM_CHUNKS = (
+    8  # in which the slopes of a batch are taken, as time allows, and evenly spread: none, one, two, ... of them
+)
+_SPREAD = (0, 4, 2, 6, 1, 5, 3, 7)
+_LINE_SHARE = 0.6  # of the time that is left, for the slopes of a line
 _SMALLEST_JUMP = 0.05  # share of the outcome's variation along the line
+_CLEAR = 0.1  # largest relative error of a usable slope
+_FEWEST_TEETH = 4
+CLOSE = 0.05
+"""Largest expected error of a derivative that counts as the slope."""
+_DEARER = 1.5  # price of a slope in that of a discrete derivative, up to which it need be no nearer beyond doubt
 _AT_REST = 1e-3  # share of the largest variation at any time
 _UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
 _BESIDE = 0.05  # share of half a line beyond the jumps, where touching pairs are compared
@@ -70,8 +79,8 @@ class Noise:
 
     stddev: float  # standard deviation, see `STDDEVS`
     stiffness: float | None  # stiffness of all contacts in 1/s²; None is the file's
-    first: Float[np.ndarray, "motions times outcomes"]  # first-order estimates by single motions
-    zeroth: Float[np.ndarray, "motions times outcomes"]  # zeroth-order estimates by the same motions
+    first: Float[np.ndarray, "some times outcomes"]  # first-order estimates by single motions
+    zeroth: Float[np.ndarray, "motions times outcomes"]  # zeroth-order estimates by these and more motions
     crossover: float  # the time from which zeroth order is at least as good, in s
 
     @property
@@ -81,6 +90,59 @@ class Noise:
         is_felt = zeroth > _UNFELT**2 * np.nanmax(zeroth, initial=0.0)
         ratios = zeroth[is_felt] / np.maximum(first[is_felt], 1e-12 * zeroth[is_felt])
         return float(np.median(ratios)) if ratios.size else np.nan
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Relative errors of one kind of derivative at all readings, 1 at most, and from how many motions a line its mean is."""
+
+    kind: Kind
+    errors: Float[np.ndarray, " readings"]
+    num_motions: int
+
+    @property
+    def error(self) -> float:
+        """The error to expect: the mean, with what the scatter of single motions adds."""
+        return float(self.errors.mean()) if self.errors.size else np.nan
+
+
+def slopes(lines: Sequence[Line]) -> tuple[Slope, ...]:
+    """Return the errors of each derivative over all lines, times and outcomes with a clear slope."""
+    found = []
+    for kind in KINDS:
+        errors, counts = [np.zeros(0)], [0]
+        for line in lines:
+            comparison = line.plain
+            at = comparison.gradients.index(kind)
+            # An outcome with hardly a tooth has the slope of that tooth: then only the slope at the shorter step counts.
+            is_told = comparison.num_teeth >= _FEWEST_TEETH
+            truths = [line.fine.slope, np.where(is_told, comparison.slope, line.fine.slope)]
+            spread = np.where(is_told, np.maximum(comparison.slope_error, line.fine.slope_error), line.fine.slope_error)
+            size = np.abs(line.fine.slope)
+            is_clear = (size > line.fine.resolution) & (spread <= np.maximum(_CLEAR * size, line.fine.resolution))
+            mean = comparison.mean[at]
+            off_by = np.maximum(np.min(truths, axis=0) - mean, mean - np.max(truths, axis=0))
+            off_by = np.maximum(
+                off_by, np.where(np.isnan(off_by), np.inf, comparison.mean_error[at])
+            )  # luck is no merit
+            counts.append(int(np.isfinite(comparison.derivatives[at]).all(axis=(1, 2)).sum()))
+            errors.append(
+                np.minimum(np.nan_to_num(off_by / np.maximum(size, line.fine.resolution), nan=1.0), 1.0)[is_clear]
+            )
+        found.append(Slope(kind, np.concatenate(errors), max(counts)))
+    return tuple(found)
+
+
+def nearest(found: Sequence[Slope], price: int | float = np.inf) -> Kind:
+    """Return the derivative to take: the slope, at a price in that of the discrete one, or that where it is as near.
+
+    A mean square would count a few readings alone, and how many are right within their errors would reward scatter.
+    """
+    slope, discrete = found
+    gains = discrete.errors - slope.errors
+    is_nearer = not gains.size or gains.mean() > gains.std() / np.sqrt(gains.size)
+    is_cheap = price <= _DEARER and (not gains.size or gains.mean() > 0)
+    return "slope" if (is_nearer or is_cheap) and not discrete.error <= CLOSE else "discrete"
 
 
 @dataclass(frozen=True)
@@ -108,7 +170,7 @@ def measure(
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
-    lengths = _lengths(mover, motions, onsets, seconds)
+    lengths = _lengths(mover, motions, order[0], begins[0], onsets, seconds)
     num_steps = lengths[-1]
     # A motion with a late first touch starts shortly before it.
     begins = [min(begin, motions.controls.shape[1] - num_steps) for begin in begins]
@@ -117,33 +179,31 @@ def measure(
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
     directions = [_direction(scene, rng, num_steps, motions.touch_speed or 1.0, i) for i in range(_NUM_LINES)]
     softer = [SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))] if scene.pairs else []
-    settings = [(stddev, soft) for soft in [None, *softer] for stddev in STDDEVS]
-    asked: list[tuple[str, int, Callable[[], Line | Noise]]] = [
-        (f"a line along {one[0]}", _LINE_BATCHES, functools.partial(probe.line, *at, *one))
+    asked: list[tuple[str, Callable[..., Line | Noise]]] = [
+        (f"a line along {one[0]}", functools.partial(probe.line, *at, *one))
         for at, one in zip(chosen, directions, strict=True)
     ]
-    for stddev, stiffness in settings:
+    for stddev, stiffness in [(stddev, soft) for soft in [None, *softer] for stddev in STDDEVS]:
         words = "" if stiffness is None else f" with contacts at {format_number(stiffness)} 1/s²"
         own_rng = np.random.default_rng(int(rng.integers(2**31)))
-        task = functools.partial(probe.noise, *chosen[0], stddev, stiffness, own_rng)
-        asked.append((f"noise of {stddev:g}{words}", _NOISE_BATCHES, task))
+        asked.append(
+            (f"noise of {stddev:g}{words}", functools.partial(probe.noise, *chosen[0], stddev, stiffness, own_rng))
+        )
     # In order of importance, since the last are left out where time is short: a line, noise, then the others.
     asked.insert(1, asked.pop(_NUM_LINES))
     found, left_out, end = [], [], mover.end
     of_kind = lambda kind: tuple(one for one in found if isinstance(one, kind))  # noqa: E731
     so_far = lambda: Measured(np.array(lengths) * motions.timestep, of_kind(Line), of_kind(Noise), tuple(left_out))  # noqa: E731
     # One after the other: two at once deadlocked on dm_control's humanoid (two cores, jax 0.10.2).
-    for words, num_batches, task in asked:
+    for number, (words, task) in enumerate(asked):
         # A verdict without a line is useless: the first one may take twice the remaining time.
         is_first = not found and not left_out
         mover.end = max(end, time.perf_counter() + 2 * seconds) if is_first else end
-        # The duration is estimated from the previous steps.
         try:
-            if time.perf_counter() + num_batches * num_steps * mover.step_seconds > mover.end:
-                raise TimeoutError
-            found.append(task())
+            found.append(task(nearest(slopes(of_kind(Line)))) if "noise" in words else task())
             if is_first:
                 first(so_far())
+            log(f"{number + 1} of {len(asked)}: {words}")
         except TimeoutError:
             left_out.append(words)
         except KeyboardInterrupt:
@@ -153,16 +213,19 @@ def measure(
     return so_far()
 
 
-def _lengths(mover: Mover, motions: Motions, onsets: list[int], seconds: int | float) -> list[int]:
-    """Choose the number of steps, by first touches and step time, and the steps at which to look."""
+def _lengths(
+    mover: Mover, motions: Motions, motion: int, begin: int, onsets: list[int], seconds: int | float
+) -> list[int]:
+    """Choose the number of steps, by first touches and the time of steps about one, and the steps at which to look."""
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
-    still = np.zeros(motions.qvel.shape[2])
+    still, size = np.zeros(motions.qvel.shape[2]), mover.size // _NUM_CHUNKS
     direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
-    states = _repeated(motions.state(0, 0), mover.size)
-    controls = np.repeat(motions.controls[:1, :_TRIED_STEPS], mover.size, axis=0)
-    for _ in range(2):  # of which the first begins with threads and memory, and is not timed
-        mover.move("slope", states, controls, direction, [_TRIED_STEPS])
-    affordable = seconds / (_NUM_BATCHES * mover.step_seconds)
+    begin = max(0, min(begin + _BEFORE, motions.controls.shape[1]) - _TRIED_STEPS // 2)
+    states = _repeated(motions.state(motion, begin), size)
+    controls = np.repeat(motions.controls[motion, None, begin : begin + _TRIED_STEPS], size, axis=0)
+    for _ in range(2):
+        mover.move("slope", states, controls, direction, [controls.shape[1]])
+    affordable = seconds / max(4 * mover.seconds("slope", mover.size), 1e-9)
     num_steps = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
     return sorted({max(1, round(num_steps * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
 
@@ -204,19 +267,21 @@ class _Probe:
         state, controls = self._at(motion, begin)
 
         def along(kind: Kind, places: Float[np.ndarray, " motions"]) -> Moved:
-            states = _repeated(state, self.mover.size)
+            states = _repeated(state, len(places))
             states.qpos[:] = moved(self.scene.mj_model, states.qpos, direction.positions, places)
             states.qvel[:] += places[:, None] * direction.velocities
             varied = controls + places[:, None, None] * direction.controls
             return self.mover.move(kind, states, varied, direction, self.lengths)
 
         places = phases((-1.0, 1.0), self.mover.size)
-        found = [along(kind, places) for kind in (*KINDS, "fine")]
-        spreads = np.nanstd(found[0].outcomes, axis=0)
+        own, fine = along("discrete", places), along("fine", places)
+        found = [self._in_time(functools.partial(along, "slope"), places), own, fine]
+        spreads = np.nanstd(own.outcomes, axis=0)
         is_felt = spreads > _UNFELT * np.nanmax(spreads, initial=_UNFELT)
         *own, fine = (one.where(is_felt) for one in found)
-        derivatives = [one.derivatives for one in own]
-        plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own[0], fine))
+        # Both are seen at the same motions.
+        derivatives = [own[0].derivatives, np.where(np.isnan(own[0].derivatives), np.nan, own[1].derivatives)]
+        plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own[1], fine))
         centre = np.nanmean(fine.outcomes[:, -1], axis=0)
         # Outcomes at rest vary by rounding alone.
         moves_start = direction.positions.any() or direction.velocities.any()
@@ -227,8 +292,28 @@ class _Probe:
         jumps = jumps_along(ends, (-1.0, 1.0), **sizes, smallest=_SMALLEST_JUMP)
         pose = self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else "")
         changed = self._changed(state, controls, direction, jumps)
-        growth = np.median(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
-        return Line(pose, words, plain, shorter, jumps, changed, growth, own[0].num_diverged + fine.num_diverged)
+        growth = np.nanmedian(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
+        return Line(pose, words, plain, shorter, jumps, changed, growth, own[1].num_diverged + fine.num_diverged)
+
+    def _in_time(self, move: Callable[[np.ndarray], Moved], values: np.ndarray, share: float = _LINE_SHARE) -> Moved:
+        """Move values of a batch in chunks as long as there is time, the first in any case; the others are NaN.
+
+        Slopes take most of the time. A few motions tell them nearly as well as all, where they scatter little.
+        """
+        until = time.perf_counter() + share * (self.mover.end - time.perf_counter())
+        chunk, whole = self.mover.seconds("slope", self.lengths[-1] * len(values)) / _NUM_CHUNKS, None
+        for number, first in enumerate(_SPREAD):
+            if number and not time.perf_counter() + chunk < until:
+                break
+            part = move(values[first::_NUM_CHUNKS])
+            if whole is None:
+                room = lambda x: np.full((len(values), *np.shape(x)[1:]), np.nan)  # noqa: E731
+                whole = Moved(*map(room, (part.outcomes, part.derivatives, part.growth)), 0)
+            for name in ("outcomes", "derivatives", "growth"):
+                getattr(whole, name)[first::_NUM_CHUNKS] = getattr(part, name)
+            chunk = self.mover.seconds("slope", self.lengths[-1] * len(values)) / _NUM_CHUNKS
+        assert whole is not None
+        return whole
 
     def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
         """Return the pairs that touch only on one side of the jumps; a glancing hit jumps once per time step."""
@@ -241,7 +326,9 @@ class _Probe:
             sides.append(pairs_at(self.scene, start, controls + x * direction.controls, REFINED))
         return tuple(sorted(sides[0] ^ sides[1]))
 
-    def noise(self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: Generator) -> Noise:
+    def noise(
+        self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: Generator, kind: Kind = "slope"
+    ) -> Noise:
         """Estimate one derivative by both orders, with noise on all controls (or the initial velocities)."""
         state, controls = self._at(motion, begin)
         size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)
@@ -251,14 +338,22 @@ class _Probe:
         wiggle = smooth(rng, steps, len(half), timestep) if has_controls else rng.normal(size=(1, still.size))
         along = wiggle / np.sqrt((wiggle**2).sum())
         noise = stddev * rng.normal(size=(size, *along.shape))
-        states = _repeated(state, size)
-        if has_controls:
-            direction, noisy = Direction(still, still, along * half), controls + noise * half
-        else:
-            direction, noisy = Direction(still, along[0], controls), np.repeat(controls[None], size, axis=0)
-            states.qvel[:] += noise[:, 0]
+        direction = Direction(still, still, along * half) if has_controls else Direction(still, along[0], controls)
         softness = None if stiffness is None else Softness(stiffness=stiffness, damping_ratio=1.0)
-        found = self.mover.move("slope", states, noisy, direction, self.lengths, softness)
+
+        def under(kind: Kind, noise: np.ndarray) -> Moved:
+            states, noisy = _repeated(state, len(noise)), np.repeat(controls[None], len(noise), axis=0)
+            if has_controls:
+                noisy = noisy + noise * half
+            else:
+                states.qvel[:] += noise[:, 0]
+            return self.mover.move(kind, states, noisy, direction, self.lengths, softness)
+
+        found = under("discrete", noise)
+        if kind == "slope":
+            found = dataclasses.replace(
+                found, derivatives=self._in_time(functools.partial(under, kind), noise).derivatives
+            )
         # An outcome depends only on the noise of earlier steps.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
@@ -269,13 +364,14 @@ class _Probe:
 
 def estimates(costs: np.ndarray, derivatives: np.ndarray, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return single estimates of first and zeroth order by motion, time and outcome, of finite motions; NaN of fewer than two."""
-    is_finite = np.isfinite(costs).all(axis=(1, 2)) & np.isfinite(derivatives).all(axis=(1, 2))
-    if is_finite.sum() < 2:
+    is_finite = np.isfinite(costs).all(axis=(1, 2))
+    is_known = is_finite & np.isfinite(derivatives).all(axis=(1, 2))
+    if is_known.sum() < 2:
         return np.full_like(costs[:2], np.nan), np.full_like(costs[:2], np.nan)
-    costs, derivatives, scores = costs[is_finite], derivatives[is_finite], scores[is_finite]
+    costs, scores = costs[is_finite], scores[is_finite]
     # The baseline leaves the motion itself out.
     baselines = (costs.sum(axis=0) - costs) / (len(costs) - 1)
-    return derivatives, (costs - baselines) * scores
+    return derivatives[is_known], (costs - baselines) * scores
 
 
 def crossover(times: np.ndarray, first: np.ndarray, zeroth: np.ndarray) -> float:

@@ -40,6 +40,8 @@ _KNOTS_PER_SECOND = 4.0  # slow enough for bodies to follow
 _REACH = 0.8  # share of half the range, so that small changes are not clipped
 _REPLAYED = 100  # steps before and after the first touch, within which effects show
 _SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding in double precision over these steps
+_TIMED = 40  # steps of which the price is taken
+_ROUNDING = 1e-6  # m, of gaps in single precision
 _CLEARANCE = 0.01  # m, beyond the margin: a nearer pair may touch in similar motions
 Kind = Literal["slope", "discrete", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")
@@ -74,6 +76,7 @@ class Motions:
     touches: tuple[Touch, ...]  # pairs that begin to touch, in order of time
     touching: tuple[str, ...]  # pairs in contact from the first step on
     idle: tuple[str, ...]  # actuators whose control has no effect
+    exact: tuple[str, ...] = ()  # pairs that touch to rounding in the first pose
 
     @property
     def touch_speed(self) -> float:
@@ -116,7 +119,8 @@ def random_motions(scene: Scene, rng: Generator) -> Motions:
     begin = max(0, int(onsets[0]) - _REPLAYED)
     window = controls[0, begin : begin + 2 * _REPLAYED]
     idle = _idle(scene, {name: x[:1, begin] for name, x in path.items()}, window, half)
-    return Motions(names, qpos, qvel, act, controls, timestep, bad_steps, onsets, touches, touching, idle)
+    exact = touching_exactly(scene, qpos[0, 0])
+    return Motions(names, qpos, qvel, act, controls, timestep, bad_steps, onsets, touches, touching, idle, exact)
 
 
 def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
@@ -157,6 +161,32 @@ def run(
     return path if follow is None else path | {"change": found["change"]}
 
 
+def seconds_of(scene: Scene, num_steps: int) -> dict[str, float]:
+    """Return how long a "motion" and its gradients by the controls take, by kind: one of a batch by C MuJoCo, from the start."""
+    model, timed, rng = scene.mj_model, min(num_steps, _TIMED), np.random.default_rng(0)
+    pool = pool_of(model)
+    num = 2 * pool.num_threads
+    _, *start = next(_starts(scene, scene.to_mujoco()))
+    numbers = {name: np.asarray(value)[None] for name, value in changed_numbers(scene).items()}
+    given = {name: np.tile(x, (num, 1)) for name, x in zip(("qpos", "qvel", "act"), start, strict=True)}
+    given["time"] = np.zeros((num, 1))
+    controls = key_controls(model) + 0.1 * half_range(scene) * rng.normal(size=(num, timed, model.nu))
+    product = functools.partial(pool.product, wanted=("ctrl",) * bool(model.nu))
+    calls, found = {"motion": pool.run} | {kind: functools.partial(product, gradient=kind) for kind in KINDS}, {}
+    for kind, call in calls.items():
+        for steps in (2, timed):  # the first begins with threads and memory
+            began = time.perf_counter()
+            call(numbers, given, {"ctrl": controls[:, :steps]})
+            found[kind] = (time.perf_counter() - began) / num * num_steps / steps
+    return found
+
+
+def key_controls(model: mujoco.MjModel) -> Float[np.ndarray, " nu"]:
+    """Return the controls of the first key frame, or zeros, within the actuators' ranges."""
+    low, high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
+    return np.clip(model.key_ctrl[0] if model.nkey else np.zeros(model.nu), low, high)
+
+
 def held(path: _States) -> tuple[_States, Int[np.ndarray, " motions"]]:
     """Return motions, held from their first bad step on, and these steps."""
     is_good: Any = np.isfinite(path["qpos"]).all(axis=2) & (np.abs(path["qvel"]) < VELOCITY_LIMIT).all(axis=2)
@@ -193,12 +223,24 @@ def most_contacts(scene: Scene, qpos: Float[np.ndarray, "motions states nq"]) ->
     """Return the largest number of near contacts of one friction dimension in any pose; at least 1."""
     model = scene.to_mujoco()
     model.geom_margin[:] += _CLEARANCE / 2  # the margins of both geoms add up
+    model.body_margin[:] += _CLEARANCE / 2
     data, most = mujoco.MjData(model), 1
     for pose in qpos.reshape(-1, model.nq):
         data.qpos[:] = pose
         mujoco.mj_fwdPosition(model, data)
         most = max(most, *np.bincount(data.contact.dim, minlength=1).tolist())
     return most
+
+
+def touching_exactly(scene: Scene, qpos: Float[np.ndarray, " nq"]) -> tuple[str, ...]:
+    """Return the pairs that single precision may tell from touching, or not, otherwise than double precision does."""
+    model = scene.to_mujoco()
+    margin = np.array(model.geom_margin)
+    model.geom_margin[:] += _ROUNDING
+    (data := mujoco.MjData(model)).qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    near = {tuple(map(int, one.geom)): one.dist - margin[one.geom].sum() for one in data.contact}
+    return tuple(_pair(model, pair) for pair, gap in near.items() if abs(gap) < _ROUNDING)
 
 
 def _pair(model: mujoco.MjModel, geoms: tuple[int, ...]) -> str:
@@ -260,7 +302,7 @@ class Moved:
 
 @dataclass
 class Mover:
-    """Simulator of batches of `size` motions in a scene; none starts later than `end`, by `time.perf_counter`."""
+    """Simulator of batches of `size` motions in a scene; none is foretold to end later than `end`, by `perf_counter`."""
 
     scene: Scene
     size: int
@@ -268,13 +310,12 @@ class Mover:
     end: float = math.inf
 
     def __post_init__(self):
-        self._judge = functools.cache(self._judge_at)
-        self._num_steps, self._seconds, self._is_warm = 0, 0.0, False
+        self._judge, self._warm, self._spent = functools.cache(self._judge_at), set(), {}
 
-    @property
-    def step_seconds(self) -> float:
-        """The mean duration of a step of a batch with its slope, so far."""
-        return self._seconds / max(self._num_steps, 1)
+    def seconds(self, kind: Kind, num_steps: int) -> float:
+        """Return how long steps of motions, all added up, will take with a kind of derivative, by the batches so far."""
+        steps, seconds = self._spent.get(kind, (1, 0.0))
+        return num_steps * seconds / steps
 
     def move(
         self,
@@ -285,12 +326,12 @@ class Mover:
         lengths: Sequence[int],
         softness: Softness | None = None,
     ) -> Moved:
-        """Simulate a batch with its tangent along a direction, and return the outcomes after the given steps.
+        """Simulate at most `size` motions with their tangents along a direction, and return the outcomes after the given steps.
 
         Raises:
-            TimeoutError: after `end`.
+            TimeoutError: if it would end after `end`, by the batches so far.
         """
-        if time.perf_counter() > self.end:
+        if time.perf_counter() + self.seconds(kind, len(controls) * lengths[-1]) > self.end:
             raise TimeoutError
         start = start_of(states)
         num, steps = len(controls), lengths[-1]
@@ -301,16 +342,21 @@ class Mover:
         refined = REFINED if kind == "fine" else 1
         started = time.perf_counter()
         found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)
-        if self._is_warm and kind == "slope":
-            self._num_steps, self._seconds = self._num_steps + steps, self._seconds + time.perf_counter() - started
-        self._is_warm = True
+        if kind in self._warm:  # the first begins with threads and memory, and is not timed
+            before = self._spent.get(kind, (0, 0.0))
+            self._spent[kind] = before[0] + num * steps, before[1] + time.perf_counter() - started
+        self._warm.add(kind)
         course = found.pop("change", np.full((num, steps, len(change)), np.nan))
         path, bad_steps = held({name: x[:, ::refined] for name, x in found.items()})
         bad = bad_steps >= 0
         course = np.concatenate([np.tile(change, (num, 1, 1)), np.where(bad[:, None, None], 0.0, course)], axis=1)
-        outcomes, derivatives = self._judge(tuple(lengths))(bad, (*path.values(), controls), course, pushes)
+        batch = bad, (*path.values(), controls), course, pushes
+        filled = jax.tree.map(
+            lambda x: np.resize(x, (self.size, *x.shape[1:])), batch
+        )  # so that one program judges all
+        outcomes, derivatives = (np.asarray(x)[:num] for x in self._judge(tuple(lengths))(*filled))
         growth = np.linalg.norm(course[:, list(lengths)], axis=2) / (np.linalg.norm(change) or 1.0)
-        return Moved(np.asarray(outcomes), np.asarray(derivatives), growth, int(bad.sum()))
+        return Moved(outcomes, derivatives, growth, int(bad.sum()))
 
     def _judge_at(self, lengths: tuple[int, ...]) -> Callable:
         """Return a compiled function from a batch of motions and tangents to outcomes and their derivatives."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,14 +16,15 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function, is_known, real, whole
-from mjxgrad._text import Paged, format_number
-from mjxgrad.checking.check import Source, _outcomes
+from mjxgrad._text import Paged, aligned, duration, format_number
+from mjxgrad.checking.check import Source, _outcomes, in_double
 from mjxgrad.checking.costs import Cost, named_cost
-from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range
+from mjxgrad.checking.findings import exact_text, percent
+from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range, seconds_of, touching_exactly
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
-from mjxgrad.diagnostics.bias_variance import ESTIMATES
-from mjxgrad.engines import QUICK, engine_of
+from mjxgrad.diagnostics.bias_variance import BATCH, ESTIMATES
+from mjxgrad.engines import ENGINES, QUICK, engine_of
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.objective.task import SceneTask
@@ -34,16 +36,16 @@ from mjxgrad.stepping import Contact, Discrete, EngineName, Slope
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
 _SHORT = 0.33  # time step times the frequency of a contact, from which it lasts at most three steps
+_UNFELT = 1e-9  # of the cost, gradients that are rounding
 _PAIRS = 256  # pairs of rollouts at once
 _FEW = 8  # numbers of a direction that are printed
-_NONE, _BLIND = 0.05, 0.25  # shares of the truth: a bias that counts as none, and one that intervals must exclude
 
 
 def scene_task(
     scene: Scene,
     cost: str | Cost | None = None,
     *,
-    start: str | None = None,
+    start: str | int | None = None,
     horizon: int | None = None,
     contact: Contact = Slope(),
     seed: int = 0,
@@ -198,38 +200,85 @@ class Sweep(Paged):
         """The labels of the rows."""
         return [format_number(k) + " (file)" * bool(k == self.own) for k in self.result.knob[1]]
 
+    def errors(self) -> dict[str, Float[np.ndarray, " softness"]]:
+        """Return the error to expect of a gradient from 16 rollouts, over the gradient's size, by estimate.
+
+        Its square is that of the bias, less what the bias's own error adds, and a sixteenth of the variance of one rollout.
+        """
+        table, found = self.result.table(), {}
+        for name in ESTIMATES:
+            if f"{name}_bias" in table:
+                bias, half = table[f"{name}_bias"][:, 0], table[f"{name}_bias_high"] - table[f"{name}_bias_low"]
+                square = np.maximum(bias**2 - (half[:, 0] / 4) ** 2, 0) + table[f"{name}_variance"][:, 0] / BATCH
+                found[name] = np.sqrt(square) / np.abs(table["truth"][:, 0])
+        return found
+
+    def best(self) -> list[str]:
+        """Return the estimate to take at each stiffness: that of least error; α-order where it gains more than a tenth."""
+        errors = self.errors()
+        by_gain = {
+            name: np.nan_to_num(x * (1.1 if name == "alpha_order" else 1), nan=np.inf) for name, x in errors.items()
+        }
+        return [min(by_gain, key=lambda name: by_gain[name][row]) for row in range(len(self.labels))]
+
     @property
     def headline(self) -> str:
-        """The answer in a line: the stiffnesses where an estimate has no relevant bias, and none too small to see."""
-        table, found = self.result.table(), {}
-        truth = abs(table["truth"])
-        measured = [truth, *(table[f"{name}_bias"] for name in ESTIMATES if f"{name}_bias" in table)]
-        if len(truth) > 1 and not any(np.ptp(one, axis=0).any() for one in measured):
+        """The answer: what to take at the file's own contact, how sure, what it costs, and from which stiffness not."""
+        table = self.result.table()
+        measured = [abs(table["truth"]), *(table[f"{name}_bias"] for name in ESTIMATES if f"{name}_bias" in table)]
+        if len(table["truth"]) > 1 and not any(np.ptp(one, axis=0).any() for one in measured):
             return "Stiffness changes nothing: nothing touches in these motions; start nearer, or look further ahead."
-        for name, words in ESTIMATES.items():
-            if f"{name}_bias" in table:
-                width = table[f"{name}_bias_high"] - table[f"{name}_bias_low"]
-                is_off = table[f"{name}_is_biased"] & (abs(table[f"{name}_bias"]) > _NONE * truth)
-                good: list[bool] = (~is_off & (width / 2 <= _BLIND * truth)).all(axis=1).tolist()  # pyright: ignore[reportAssignmentType]
-                until = good.index(False) if False in good else len(good)
-                where = "at " + ", ".join(label for label, one in zip(self.labels, good, strict=True) if one)
-                where = (f"up to {self.labels[until - 1]}" if until == sum(good) else where) + " 1/s²"
-                none = "nowhere" if is_off.any() else "too noisy to tell"
-                found.setdefault("everywhere" if all(good) else where if any(good) else none, []).append(words)
-        return f"No bias seen to {_BLIND:.0%}: {'; '.join(', '.join(words) + ' ' + where for where, words in found.items())}."
+        if np.abs(table["truth"]).max() <= _UNFELT * np.abs(self.result.cost).max():
+            return (
+                "The noise does not reach the cost: nothing moved touches what it sees; start nearer, or look further."
+            )
+        row, best, errors = int(np.argmin(abs(self.result.knob[1] - self.own))), self.best(), self.errors()
+        taken, off = best[row], errors[best[row]][row]
+        ratio = (table[f"{taken}_variance"] / table["zeroth_variance"])[row, 0]
+        reach = np.abs([table[f"{taken}_bias{end}"][row, 0] for end in ("_low", "_high")]).max()
+        reach /= abs(table["truth"][row, 0])
+        sure = "" if taken == "zeroth" else f"its variance is {ratio:.2g} of zeroth order's, "
+        if taken == "zeroth":
+            other = errors.get("first", [np.inf])[row]
+            sure = f"it has no bias, and first order is {percent(other)} off, "
+        elif table[f"{taken}_is_biased"][row, 0]:
+            sure += f"its bias {percent(abs(table[f'{taken}_bias'] / table['truth'])[row, 0])} of the gradient, "
+        else:
+            sure += f"and no bias was seen above {percent(reach)}, "
+        cost = f"{BATCH * self.result.seconds:.2g} s a gradient of {BATCH} rollouts"
+        answer = f"Take {ESTIMATES[taken]}: {sure}{percent(off)} off in all; {cost}."
+        if reach > 1 and taken != "zeroth":
+            answer = answer.removesuffix(".") + "; more samples make it surer."
+        for label, other in zip(self.labels[row + 1 :], best[row + 1 :], strict=True):
+            if other != taken:
+                return f"{answer} From {label} 1/s² on {ESTIMATES[other]}."
+        return answer
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.headline}\n\n{self.question}\n\n{self.result.summary(self.labels)}"
+        lines = [f"{self.name}: {self.headline}", self.question, "\n".join(aligned(self._rows(), str.ljust))]
+        return "\n\n".join([*lines, self.result.summary(self.labels)])
+
+    def _rows(self) -> list[list[str]]:
+        """Return the table of errors as text, header first; the estimate to take is marked."""
+        errors, best = self.errors(), self.best()
+        head = ["stiffness, 1/s²", *(f"error: {ESTIMATES[name]}" for name in errors), "take"]
+        cells = [[percent(x) for x in errors[name]] for name in errors]
+        return [head, *map(list, zip(self.labels, *cells, [ESTIMATES[name] for name in best], strict=True))]
 
     def as_html(self) -> str:
         """Return the sweep as a self-contained page; needs `mjxgrad[render]`."""
         parts = [svg(functools.partial(self.result.plot, one), f"{one} over stiffness") for one in ("bias", "variance")]
-        head, *rows = self.result.rows(self.labels)
         told = f"Bars: {self.result.confidence:.0%} intervals. Bias in cost per unit of what is moved, variance in its square."
-        blocks = [Block(text=self.question, drawings=parts, caption=told), Block(table=Table(head, rows))]
-        return page(self.headline, f"mjxgrad sweep {self.name}", [*blocks, Block(items=self.result.notes())])
+        head, *rows = self._rows()
+        mark = frozenset((i, 1 + list(self.errors()).index(name)) for i, name in enumerate(self.best()))
+        caption = f"Error of a gradient from {BATCH} rollouts, bias and scatter, over the gradient: the least is bold."
+        table = Block(table=Table(head, rows, caption, mark))
+        details = Block(folded="Bias and variance in numbers", code=self.result.summary(self.labels))
+        blocks = [table, Block(drawings=parts, caption=told), Block(text=self.question), details]
+        return page(self.headline, f"mjxgrad sweep {self.name}", blocks)
 
 
+@in_double
 def sweep(
     source: Source,
     cost: str | Cost | None = None,
@@ -257,8 +306,9 @@ def sweep(
         seed: seed of all random numbers.
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
         engine: who steps, see `Scene.with_engine`; by default the scene's own.
-        **task_settings: `start`, a key frame with its controls, by default the reference pose, at rest; `horizon`, a number of
-            time steps, by default half a second, but 50 to 300; `contact`, see `rollout`, by default `mg.Slope()`.
+        **task_settings: `start`, a key frame with its controls, by default the first, else the reference pose, at rest;
+            `horizon`, a number of time steps, by default half a second, but 50 to 300; `contact`, see `rollout`, by default
+            `mg.Slope()`.
 
     Raises:
         ValueError: if there is no such file, function, body or key frame, or a number is out of range.
@@ -273,6 +323,8 @@ def sweep(
     function("log", log, "text")
     scene = source if isinstance(source, Scene) else load_scene(source)
     scene = scene if engine is None else scene.with_engine(engine)
+    if task_settings.get("start") is None and scene.mj_model.nkey:
+        task_settings["start"] = scene.mj_model.key(0).name or 0
     task = scene_task(scene, cost, seed=seed, **task_settings)
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
@@ -281,7 +333,25 @@ def sweep(
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
     given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
-    progress = None if log is None else lambda done, total: log(f"{done} of {total} stiffnesses")
+    say, began, last = log or (lambda _: None), time.perf_counter(), [0]
+
+    def progress(done: int, total: int) -> None:
+        spent, part = time.perf_counter() - began, -(-8 * done // total)
+        if part > last[0] or done == 1:
+            last[0] = part
+            say(f"{done} of {total} parts, {duration(spent * (total - done) / done)} left")
+
+    by, what = (
+        engine_of(scene, task.contact).title,
+        f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each",
+    )
+    if engine_of(scene, task.contact) is ENGINES[QUICK] and task.num_controls:
+        price = seconds_of(scene, task.horizon)
+        one = price[getattr(task.contact, "gradient", "slope")]
+        seconds = len(swept) * (num_samples * one + num_reference * price["motion"])
+        say(f"{what}: about {duration(seconds)}, {BATCH * one:.2g} s a gradient of {BATCH} rollouts, by {by}")
+    else:
+        say(f"{what}: compiling by {by}")
     result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=progress, **given)
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
@@ -293,16 +363,16 @@ def sweep(
         "Swept contacts are critically damped." if scene.pairs else none,
         f"Derivative: {kind}, by {engine_of(task.scene, contact).title}.",
     ]
+    if exact := touching_exactly(scene, np.asarray(task.state.qpos)):
+        told.append(exact_text(exact))
     if isinstance(contact, Slope) and scene.pairs and swept[-1] >= shortest:
         short = "on contacts last at most three time steps, and the slope is off, most by MJX: shorten the time step"
         told.append(f"From {format_number(float(f'{shortest:.1g}'))} 1/s² {short}.")
-    table, row = result.table(), swept.index(knob.own) if scene.pairs else 0
-    if len(result.cost) and not np.isfinite(table["truth"]).any():
+    if not np.isfinite(result.table()["truth"]).any():
         raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
-    if left_out := len(swept) - len(result.cost):
-        told.append(f"Interrupted: {left_out} of {len(swept)} stiffnesses are left out.")
-    if row < len(result.cost) and table["zeroth_variance"][row, 0] > 0:
-        ratios = {x: table[f"{x}_variance"] / table["zeroth_variance"] for x in ESTIMATES if f"{x}_variance" in table}
-        ratios = [f"{ratio[row, 0]:.2g} for {ESTIMATES[x]}" for x, ratio in ratios.items() if x != "zeroth"]
-        told.append(f"Variance over that of zeroth order, in the file's own contact: {', '.join(ratios)}.")
+    if result.share < 1:
+        left = f", without {len(swept) - len(result.cost)} of {len(swept)} stiffnesses" * (
+            len(result.cost) < len(swept)
+        )
+        told.append(f"Interrupted after {result.share:.0%} of the rollouts{left}.")
     return Sweep(scene.name, " ".join(told), knob.own, result)

@@ -13,7 +13,9 @@ error falls as 1/cells at a jump and faster elsewhere. Quadrature on regular poi
 
 import contextlib
 import dataclasses
+import functools
 import threading
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, PyTree, Shaped
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from mjxgrad._arrays import function, one_key, whole
 from mjxgrad._programs import compile_once
@@ -45,7 +47,9 @@ from mjxgrad.scene import SceneWarning
 # The Gaussian weight beyond six standard deviations is below 1e-7 of its peak.
 REACH = 6.0
 # Rollouts of one α-order estimate, from which it also chooses α.
-_BATCH = 16
+BATCH = 16
+# Rounds in which all softnesses get their samples, so that an interruption leaves some of each; and fewest samples of one.
+_ROUNDS, _FEWEST = 8, 32
 # XLA keeps 1.3 of two cores busy with one such program.
 _WORKERS = 2
 # In words, with colours and markers that colour-blind readers can tell apart (Okabe and Ito 2008).
@@ -128,6 +132,8 @@ class BiasVariance(eqx.Module, Printed):
         landscape: the cost along the parameter at every softness; None unless there is a single parameter with noise.
         warnings: the warnings of the scene at each softness, such as a time step that is too long; often empty.
         confidence: coverage of every interval.
+        share: share of the rollouts that were made; below 1 after an interruption.
+        seconds: duration of one differentiated rollout, in s.
     """
 
     softness: PyTree
@@ -142,6 +148,8 @@ class BiasVariance(eqx.Module, Printed):
     landscape: Landscape | None
     warnings: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     confidence: float = eqx.field(static=True)
+    share: float = eqx.field(static=True)
+    seconds: float = eqx.field(static=True)
 
     @property
     def bias(self) -> Float[Array, "softness points dim"]:
@@ -298,9 +306,9 @@ def bias_variance(
 ) -> BiasVariance:
     r"""Measure bias and variance of first, zeroth and α-order gradient estimates at every softness and point.
 
-    All softnesses share the same noise, which makes differences between them visible. One program is compiled, at the first
-    softness. The loop over softnesses runs on the host, where it can report progress. Ctrl-C ends it with the softnesses
-    measured so far. Samples are kept for the bootstrap: memory grows with points × `num_samples` × dim.
+    All softnesses share the same noise, which makes differences between them visible. A program is compiled once, at the first
+    softness. Each softness gets an eighth of its rollouts in turn, so that Ctrl-C ends with some of all, and waits for none.
+    Samples are kept for the bootstrap: memory grows with points × `num_samples` × dim.
 
     Args:
         objective_of_softness: function from one softness to the objective; traceable.
@@ -314,7 +322,7 @@ def bias_variance(
             rollouts of its own; None takes more of the rollouts that are differentiated.
         confidence: coverage of the intervals.
         compiler_options: options for XLA.
-        progress: called after every softness with the number done and the total.
+        progress: called after every part of the work with the number done and the total.
 
     Raises:
         ValueError: if `params` is not a matrix, `softness` has no or unequal leading axes, or a number is out of range.
@@ -341,41 +349,74 @@ def bias_variance(
     # Derivatives by the noise where it is known: α-order needs them, and those by the parameters follow.
     knows_noise = type(objective).differentiate is not Objective.differentiate and not objective.has_circumstances
     wanted = {"with_gradient": True, "with_score": True, "by_noise": knows_noise}
-    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1
-    # Except on a line the reference comes from more runs of the same program, which saves a compilation.
+    is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1 and reference is None
     plan = Plan(num_samples, with_zero_noise=not is_line, **wanted)
-    has_alpha = knows_noise and num_samples >= 2 * _BATCH
-
-    measure = _program(objective_of_softness, plan, has_alpha, num_reference if is_line else None)
-    # Compiled here, since a thread does not see settings made by `with`, such as the precision.
-    lowered = measure.lower(each[0], params, key)
-    compiled = compile_once(lowered, compiler_options)
+    units = _rounds(plan)
+    part = functools.partial(_sampled, plan=plan)
+    lowered, shapes = _program(objective_of_softness, part, each[0], params, key, units[0])
+    drawn = compile_once(lowered, compiler_options)
+    line = None
+    if is_line:
+        landscape, _ = _program(
+            objective_of_softness, functools.partial(_by_landscape, num_reference=num_reference), each[0], params, key
+        )
+        line = compile_once(landscape, compiler_options)
+    has_alpha = knows_noise and num_samples >= 2 * BATCH
+    longer = lambda x: jax.ShapeDtypeStruct((x.shape[0], len(units) * x.shape[1], *x.shape[2:]), x.dtype)  # noqa: E731
+    finish = jax.jit(functools.partial(_summary, plan=plan, has_alpha=has_alpha))
+    summarise = finish.lower(jax.tree.map(longer, shapes)).compile()
+    others = range(1, 1 + -(-num_reference // num_samples))
     # C MuJoCo is called back. Two programs that wait for it at once leave JAX no thread on two cores to hand it their numbers.
     num_workers = 1 if "callback" in lowered.as_text() else _WORKERS
-    alone = threading.Lock()
+    alone, is_double = threading.Lock(), jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
-    def row(one: PyTree) -> tuple[dict[str, Any], np.ndarray]:
-        measured, samples, batches = jax.block_until_ready(compiled(one, params, key))
+    def work(job: tuple[int, int]) -> tuple[Samples, Any, float]:
+        with jax.enable_x64(is_double):  # a thread does not see settings made by `with`
+            return part_of(*job)
+
+    def part_of(number: int, i: int) -> tuple[Samples, Any, float]:
+        began = time.perf_counter()
+        samples = jax.block_until_ready(drawn(each[i], params, jax.random.split(key)[0], units[number]))
+        spent, found = time.perf_counter() - began, None
         if reference is not None:
             with alone:
-                found = reference(one, jax.random.fold_in(key, 0), num_reference)
-            measured |= dict(zip(("reference", "reference_error"), map(jnp.asarray, found), strict=True))
-        elif not is_line:
-            others = [jax.random.fold_in(key, i) for i in range(-(-num_reference // num_samples))]
-            runs = [compiled(one, params, k)[0]["reference"] for k in others]
-            measured["reference"] = sum(value for value, _ in runs) / len(runs)
-            measured["reference_error"] = jnp.sqrt(sum(error**2 for _, error in runs)) / len(runs)
-        return measured, _variance_intervals(samples, batches, confidence)
+                found = reference(each[i], jax.random.fold_in(key, number), -(-num_reference // len(units)))
+        elif line is not None:
+            found = line(each[i], params, jax.random.split(key)[1]) if number == 0 else None
+        else:
+            more = [drawn(each[i], params, jax.random.fold_in(key, k), units[number]) for k in others]
+            found = jax.block_until_ready(_unbiased(jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *more), plan))
+        return samples, found, spent
 
-    rows = []
-    # The interruption closes the map, which then begins no other row.
-    with ThreadPoolExecutor(num_workers) as pool, contextlib.suppress(KeyboardInterrupt):
-        for done in pool.map(row, each):
-            rows.append(done)
-            if progress is not None:
-                progress(len(rows), count)
-    if not rows:
+    done: list[list[tuple[Samples, Any, float]]] = [[] for _ in each]
+    jobs = [(number, i) for number in range(len(units)) for i in range(count)]
+    pool = ThreadPoolExecutor(num_workers)
+    # An interruption waits for no job that has begun.
+    with contextlib.suppress(KeyboardInterrupt):
+        try:
+            for number, found in enumerate(pool.map(work, jobs)):
+                done[jobs[number][1]].append(found)
+                if progress is not None:
+                    progress(number + 1, len(jobs))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+    if not done[0]:
         raise KeyboardInterrupt
+    rows = []
+    for pieces in filter(None, done):
+        empty = [jax.tree.map(jnp.zeros_like, pieces[0][0])] * (len(units) - len(pieces))
+        samples = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *(one for one, *_ in pieces), *empty)
+        measured, gathered, batches = summarise(samples)
+        measured["landscape"] = None
+        if line is not None:
+            measured |= pieces[0][1]
+        else:
+            values, errors = (jnp.stack([jnp.asarray(one[1][k]) for one in pieces]) for k in (0, 1))
+            measured["reference"] = values.mean(axis=0)
+            measured["reference_error"] = jnp.sqrt((errors**2).sum(axis=0)) / len(pieces)
+        rows.append((measured, _variance_intervals(gathered, batches, confidence)))
+    # The first of each kind also begins with memory.
+    spent = [one[2] for pieces in done for one in (pieces[1:] or pieces)]
     stacked = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
     ends = np.stack([row[1] for row in rows], axis=2)
@@ -386,7 +427,20 @@ def bias_variance(
         variance_intervals=dict(zip(ESTIMATES, ends, strict=False)),
         warnings=told[: len(rows)],
         confidence=confidence,
+        share=sum(map(len, done)) / len(jobs),
+        seconds=float(np.median(spent)) / units[0].size / len(params) / num_workers,
     )
+
+
+def _rounds(plan: Plan) -> Int[np.ndarray, "rounds chunks units"]:
+    """Return the units of each round, in chunks: the one without noise first, and in the end some that do not count."""
+    total = plan.num_units + plan.with_zero_noise
+    rounds = min(_ROUNDS, max(1, plan.num_samples // _FEWEST))
+    num_chunks = -(-total // (rounds * DEFAULT_CHUNK_SIZE))
+    size = -(-total // (rounds * num_chunks))
+    order = [plan.num_units] * plan.with_zero_noise + list(range(plan.num_units))
+    order += [plan.num_units + 1] * (rounds * num_chunks * size - total)
+    return np.reshape(order, (rounds, num_chunks, size))
 
 
 def _warned(
@@ -403,44 +457,43 @@ def _warned(
     return objectives[-1], tuple(told)
 
 
-def _program(
-    objective_of_softness: Callable[[PyTree], Objective], plan: Plan, has_alpha: bool, num_cells: int | None
-) -> Any:
-    """Return the jitted measurement at one softness: estimates, samples, and α-order estimates in batches."""
-
-    @jax.jit
-    def measure(
-        softness: PyTree, params: Float[Array, "points dim"], key: PRNGKeyArray
-    ) -> tuple[dict[str, Any], Samples, Array | None]:
-        objective = objective_of_softness(softness).sized_for(params[0])
-        samples_key, reference_key = jax.random.split(key)
-        by_noise = _sampled(objective, params, samples_key, plan)
-        samples = jax.vmap(_by_parameters)(by_noise) if plan.by_noise else by_noise
-        first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, unchanged))(samples)
-        mixed = (None, None)
-        if has_alpha:
-            mixed = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)
-        found = {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "landscape": None}
-        if isinstance(objective, ParameterNoise) and num_cells is not None:
-            return found | _by_landscape(objective, params, reference_key, num_cells), samples, mixed[1]
-        unbiased = jax.vmap(_unbiased)(by_noise) if plan.by_noise else (zeroth.value, zeroth.standard_error)
-        found |= {"cost": jax.vmap(Samples.noise_free_cost)(samples), "reference": unbiased}
-        return found, samples, mixed[1]
-
-    return measure
+def _program(objective_of_softness: Callable[[PyTree], Objective], part: Callable, *given: Any) -> tuple[Any, PyTree]:
+    """Return a part of the measurement at one softness, ready to be compiled, and the shapes of its result."""
+    softness, params, *rest = given
+    program = jax.jit(lambda one, at, *rest: part(objective_of_softness(one).sized_for(at[0]), at, *rest))
+    lowered = program.lower(softness, params, *rest)
+    return lowered, lowered.out_info
 
 
-def _sampled(objective: Objective, params: Float[Array, "points dim"], key: PRNGKeyArray, plan: Plan) -> Samples:
+def _summary(samples: Samples, plan: Plan, has_alpha: bool) -> tuple[dict[str, Any], Samples, Array | None]:
+    """Return the estimates from samples at all points, the samples by the parameters, and α-order estimates in batches."""
+    # The one without noise is the last in what follows, where batches are counted from the first.
+    by_noise = jax.tree.map(lambda leaf: jnp.roll(leaf, -plan.with_zero_noise, axis=1), samples)
+    samples = jax.vmap(_by_parameters)(by_noise) if plan.by_noise else by_noise
+    first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, unchanged))(samples)
+    mixed = (None, None)
+    if has_alpha:
+        mixed = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)
+    cost = jax.vmap(Samples.noise_free_cost)(samples)
+    return {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "cost": cost}, samples, mixed[1]
+
+
+def _sampled(
+    objective: Objective,
+    params: Float[Array, "points dim"],
+    key: PRNGKeyArray,
+    units: Int[Array, "chunks units"],
+    plan: Plan,
+) -> Samples:
     """Roll out samples for both estimates; all points share one compiled body."""
-    num_chunks, size = plan.chunks()
-    points, chunks = jnp.divmod(jnp.arange(len(params) * num_chunks), num_chunks)
+    points, chunks = jnp.divmod(jnp.arange(len(params) * len(units)), len(units))
 
     def one_chunk(point_and_chunk: tuple[Array, Array]) -> Samples:
         point, chunk = point_and_chunk
-        return sample(objective, params[point], jax.random.fold_in(key, point), plan, size * chunk + jnp.arange(size))
+        return sample(objective, params[point], jax.random.fold_in(key, point), plan, units[chunk])
 
     samples = jax.lax.map(one_chunk, (points, chunks))
-    return jax.tree.map(lambda leaf: leaf.reshape(len(params), num_chunks * size, *leaf.shape[2:]), samples)
+    return jax.tree.map(lambda leaf: leaf.reshape(len(params), units.size, *leaf.shape[2:]), samples)
 
 
 def _by_parameters(samples: Samples) -> Samples:
@@ -458,8 +511,8 @@ def _in_batches(
     samples: Samples, plan: Plan, zeroth: GradientEstimate
 ) -> tuple[GradientEstimate, Float[Array, "batches dim"]]:
     """Return the mean of the α-order estimates, one for each batch of samples, and all of them."""
-    count = plan.num_samples // _BATCH
-    batches = jax.tree.map(lambda leaf: leaf[: count * _BATCH].reshape(count, _BATCH, *leaf.shape[1:]), samples)
+    count = plan.num_samples // BATCH
+    batches = jax.tree.map(lambda leaf: leaf[: count * BATCH].reshape(count, BATCH, *leaf.shape[1:]), samples)
 
     def one(batch: Samples) -> tuple[Array, Array, Array]:
         parts = both_parts(batch, control_variate=True)
@@ -473,22 +526,30 @@ def _in_batches(
         zeroth,
         value=jnp.where(found.count > 1, found.mean, jnp.nan),
         standard_error=jnp.sqrt(found.squared_error()),
-        covariance_diagonal=_BATCH * found.count * found.squared_error(),
+        covariance_diagonal=BATCH * found.count * found.squared_error(),
         num_finite=found.count,
         alpha=jnp.nanmean(jnp.where(exists, alpha, jnp.nan)),
     )
     return mean, values
 
 
-def _unbiased(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-    """Return the unbiased part of α-order and its standard error; see `control_variate`."""
-    parts = both_parts(samples, control_variate=True)
-    value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
-    return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
+@functools.partial(jax.jit, static_argnames="plan")
+def _unbiased(samples: Samples, plan: Plan) -> tuple[Float[Array, "points dim"], Float[Array, "points dim"]]:
+    """Return an unbiased gradient at each point and its standard error: that part of α-order, or zeroth order."""
+
+    def one(samples: Samples) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
+        if not plan.by_noise:
+            zeroth = both_results(both_summary(samples), plan, unchanged)[1]
+            return zeroth.value, zeroth.standard_error
+        parts = both_parts(samples, control_variate=True)
+        value, squared_error = parts.mixture(jnp.zeros_like(parts.first.offset))
+        return jnp.where(parts.unbiased.count > 1, value, jnp.nan), jnp.sqrt(jnp.maximum(squared_error, 0))
+
+    return jax.vmap(one)(samples)
 
 
 def _by_landscape(
-    objective: ParameterNoise, params: Float[Array, "points dim"], key: PRNGKeyArray, num_reference: int
+    objective: ParameterNoise, params: Float[Array, "points dim"], key: PRNGKeyArray, *, num_reference: int
 ) -> dict[str, Any]:
     """Compute the cost and the reference from one landscape."""
     stddev = jnp.ravel(objective.stddev)[0].astype(params.dtype)
@@ -516,6 +577,6 @@ def _variance_intervals(
         centre = costs[is_finite].mean() if is_finite.any() else np.nan
         scored = (costs - centre)[:, None] * one.rollouts.noise_score[is_noisy, 0]
         terms = [np.where(is_finite[:, None], gradients, np.nan), scored]
-        terms += [] if batches is None else [np.sqrt(_BATCH) * np.asarray(batches[i], float)]
+        terms += [] if batches is None else [np.sqrt(BATCH) * np.asarray(batches[i], float)]
         intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
     return np.moveaxis(np.array(intervals), 0, -1)

@@ -15,6 +15,7 @@ equals its mean derivative with weight $k$ for any curvature. They differ by the
 smooth weight also averages over teeth: it vanishes at the ends, where teeth are cut.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,13 +26,15 @@ from jaxtyping import ArrayLike, Bool, Float, Int
 _FEWEST_PHASES = 32  # for eight blocks of the error bar
 _POINTS_PER_BLOCK = 4
 _MOST_BLOCKS = 24
+_DEGREE = 7  # of the trend beside which few derivatives are seen
 _ROUNDINGS = 1e3  # rounding errors of the outcome that many steps may add up
 
 
 class SlopeComparison(eqx.Module):
     """Derivatives beside the slope, in units of the outcome over those of the parameter.
 
-    With fewer than 32 finite phases, numbers are NaN and `is_resolved` is False.
+    With fewer than 32 finite outcomes, numbers are NaN and `is_resolved` is False. A derivative may be known, that is finite, at
+    some phases alone, at least 8 that are about evenly spread; then its mean is that beside a trend of the outcomes.
 
     Attributes:
         gradients: names of the derivatives, in the order of their axis.
@@ -46,7 +49,7 @@ class SlopeComparison(eqx.Module):
             and that of what the derivative leaves of changes between neighbours, where curvature that both share does not count.
         spread: standard deviation of each derivative over the phases.
         num_teeth: half the number of crossings of the outcome with its trend: about the number of teeth in the interval.
-        num_finite: number of phases with finite outcome and derivatives; only these count.
+        num_finite: number of phases with a finite outcome and derivative, of the derivative that is known at most of them.
         resolution: error of the slope by rounding of the outcome; smaller errors mean nothing.
     """
 
@@ -144,36 +147,54 @@ def compare_to_slope(
 
 def _column(u: np.ndarray, half: float, y: np.ndarray, slopes: Float[np.ndarray, "gradients phases"]) -> dict[str, Any]:
     """Compare a single outcome over the interval (-1, 1), which is `half` times as wide in the parameter."""
-    is_finite = np.isfinite(y) & np.isfinite(slopes).all(axis=0)
-    count = int(is_finite.sum())
-    if count < _FEWEST_PHASES:
+    is_finite = np.isfinite(y)
+    known = is_finite & np.isfinite(slopes)
+    count = int(known.sum(axis=1).max(initial=0))
+    if is_finite.sum() < _FEWEST_PHASES:
         nothing = dict.fromkeys(("mean", "mean_error", "standard_error", "spread"), np.full(len(slopes), np.nan))
         nothing |= dict.fromkeys(("slope", "slope_error", "num_teeth"), np.nan)
         return {**nothing, "num_finite": count}
-    u, y, slopes = u[is_finite], y[is_finite], slopes[:, is_finite]
-    weight = 1 - u**2
-    # The weights whose product with an outcome is the slope of the weighted straight line.
-    centred = u - (weight @ u) / weight.sum()
-    lever = weight * centred / (weight @ centred**2) / half
+    lever, _ = _weights(u[is_finite], half)
     # A trend of degree 3, since curvature is no error of the slope.
-    rest = _residuals(u, y, weight, 3)
-    # By parts, the slope is a mean of secants between neighbours; trapezoids of the same weights give the derivatives' mean.
-    between, middles = -np.cumsum(lever)[:-1] * half * np.diff(u), (u[1:] + u[:-1]) / 2
-    kernel = (np.append(between, 0) + np.append(0, between)) / 2
-    secants = np.diff(y) / (half * np.diff(u))
-    missed = [_residuals(middles, (one[1:] + one[:-1]) / 2 - secants, between, 1) for one in slopes]
+    rest = _residuals(u[is_finite], y[is_finite], 1 - u[is_finite] ** 2, 3)
     slope_error = _clustered(lever * rest)
-    mean_error = np.array([_clustered(kernel * _residuals(u, one, kernel, 1)) for one in slopes])
+    # Where few derivatives are known, what they leave of the trend's tells more than they do.
+    root = np.sqrt(1 - u[is_finite] ** 2)
+    trend = np.polynomial.legendre.Legendre.fit(u[is_finite], y[is_finite], _DEGREE, [-1, 1], w=root)
+    rise = lever @ trend(u[is_finite])
+    beside, around = rise - trend.deriv()(u) / half, rise * half * u - trend(u)
+    means = []
+    for own, one in zip(known, slopes, strict=True):
+        few = own.sum() < is_finite.sum()
+        means.append(_mean(u[own], half, (y + few * around)[own], (one + few * beside)[own], slope_error))
     return {
-        "slope": lever @ y,
+        "slope": lever @ y[is_finite],
         "slope_error": slope_error,
         "num_teeth": np.count_nonzero(np.diff(np.signbit(rest))) / 2,
-        "mean": slopes @ kernel,
-        "mean_error": mean_error,
-        "standard_error": np.fmin(np.hypot(mean_error, slope_error), [_clustered(between * one) for one in missed]),
-        "spread": slopes.std(axis=1, ddof=1),
         "num_finite": count,
+        **dict(zip(("mean", "mean_error", "standard_error", "spread"), np.transpose(means), strict=True)),
     }
+
+
+def _weights(u: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of outcomes in the slope of the weighted line, and by parts those of secants between neighbours."""
+    weight = 1 - u**2
+    centred = u - (weight @ u) / weight.sum()
+    lever = weight * centred / (weight @ centred**2) / half
+    return lever, -np.cumsum(lever)[:-1] * half * np.diff(u)
+
+
+def _mean(u: np.ndarray, half: float, y: np.ndarray, one: np.ndarray, slope_error: float) -> tuple[float, ...]:
+    """Return a derivative's weighted mean, its error, that of its distance from the slope, and the spread."""
+    if len(u) < 2 * _POINTS_PER_BLOCK:
+        return math.nan, math.nan, math.nan, math.nan
+    _, between = _weights(u, half)
+    # Trapezoids of the secants' weights give the derivatives' mean.
+    kernel, middles = (np.append(between, 0) + np.append(0, between)) / 2, (u[1:] + u[:-1]) / 2
+    missed = _residuals(middles, (one[1:] + one[:-1]) / 2 - np.diff(y) / (half * np.diff(u)), between, 1)
+    error = _clustered(kernel * _residuals(u, one, kernel, 1))
+    apart = min(math.hypot(error, slope_error), _clustered(between * missed))
+    return float(one @ kernel), error, apart, float(one.std(ddof=1))
 
 
 def _residuals(u: np.ndarray, y: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:
@@ -194,6 +215,6 @@ def _clustered(terms: np.ndarray) -> float:
         Bell, McCaffrey. Bias reduction in standard errors for linear regression with multi-stage samples. Survey
         Methodology 28, 2002 (the jackknifed residuals).
     """
-    blocks = np.array_split(terms, min(_MOST_BLOCKS, len(terms) // _POINTS_PER_BLOCK))
+    blocks = np.array_split(terms, max(2, min(_MOST_BLOCKS, len(terms) // _POINTS_PER_BLOCK)))
     sums = np.array([block.sum() for block in blocks])
     return float(np.sqrt((sums**2).sum() * len(sums) / (len(sums) - 1)))

@@ -31,12 +31,12 @@ from mjxgrad.scene import Scene
 _LEAST_FRICTION = 0.01  # of pyramids in single precision
 _STEPS_IN_CONTACT = 6.0  # fewest time steps in a bounce for the slope at MuJoCo's motion
 _WIDTH = 118  # characters in a laptop's terminal
-_COLUMNS = ("", "k, 1/s²", "b, 1/s", "ω₀, rad/s", "ζ", "t_c, ms", "asked, ms", "impedance", "load", "coupled", "steps")
-_LEGEND = (
-    "load: time step over the largest that gains no energy, unstable from 1 on. coupled: the same where all contacts "
-    "of the pair act at once. steps: duration of a bounce. asked: time constant in the file, where refsafe replaces it."
+_COLUMNS = (
+    ("", "k", "b", "ω₀", "ζ", "t_c", "t_c in file", "impedance", "step over", "with all", "bounce"),
+    ("", "1/s²", "1/s", "rad/s", "", "ms", "ms", "", "stable", "contacts", "in steps"),
 )
-_SPEED_COLUMNS = ("depth", "rise, steps")
+_LEGEND = "Step over stable: unstable from 1 on; with all contacts of the pair at once. t_c in file: where refsafe replaces it."
+_SPEED_COLUMNS = (("bounce", "force rises"), ("deep", "in steps"))
 # Fewest steps that resolve the rise of the impedance, and the largest first impedance that counts as continuous.
 _STEPS_NEEDED, _LARGEST_JUMP = 2.0, 0.01
 
@@ -185,7 +185,9 @@ class StabilityReport(Printed):
         lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speed}"]
         if not self.springs:
             return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
-        rows = [_COLUMNS + _SPEED_COLUMNS * (self.speed is not None), *self._rows()]
+        has_speed = self.speed is not None
+        heads = [one + more * has_speed for one, more in zip(_COLUMNS, _SPEED_COLUMNS, strict=True)]
+        rows = [*heads, *self._rows()]
         lines += [f"  {line}" for line in aligned(rows)]
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)

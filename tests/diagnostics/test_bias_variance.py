@@ -1,5 +1,7 @@
 """Bias and variance, measured where both are known."""
 
+import signal
+import threading
 import time
 
 import equinox as eqx
@@ -165,10 +167,42 @@ def test_the_landscape_is_the_cost(jumps):
 
 
 def test_everything_is_compiled_once_and_progress_is_told(jumps):
-    """Each softness is built once to hear what its scene says of it, and once more in the program."""
+    """Each softness is built once to hear what its scene says of it, and once more in each of two programs."""
     _, calls, progress = jumps
-    assert len(calls) == 3 + 1
-    assert progress == [(1, 3), (2, 3), (3, 3)]
+    assert len(calls) == 3 + 2
+    assert progress == [(part, 3 * 8) for part in range(1, 3 * 8 + 1)]
+
+
+def test_an_interruption_leaves_some_rollouts_of_each_softness_and_waits_for_none():
+    """After the first round of eight: an eighth of the samples, whose error bars cover the truth; the work that hangs is left."""
+    hangs = threading.Event()
+
+    def reference(softness, key, count):
+        reference.calls += 1
+        if reference.calls > len(WIDTHS):
+            hangs.wait(60)
+        return np.zeros((3, 1)), np.ones((3, 1))
+
+    def interrupt(done, total):
+        if done == len(WIDTHS):
+            signal.raise_signal(signal.SIGINT)
+
+    reference.calls, began = 0, time.monotonic()
+    table = bias_variance(
+        lambda width: parameter_noise(textbook.ramp(width), STDDEV),
+        POINTS,
+        jax.random.key(0),
+        softness=WIDTHS,
+        num_samples=4000,
+        reference=reference,
+        progress=interrupt,
+    )
+    hangs.set()
+    assert time.monotonic() - began < 50
+    assert table.share == 1 / 8
+    assert (table.first.num_finite == 500).all()
+    exact = exact_ramp(lambda point, width: 2 * textbook.ramp_probability(point, width) / width)
+    np.testing.assert_array_less(np.abs(table.zeroth.value[..., 0] - exact), 4 * table.zeroth.standard_error[..., 0])
 
 
 class Hidden(ParameterNoise):
