@@ -27,6 +27,7 @@ from mjxgrad.stepping import slope
 _NONE, _PLACES, _SPEEDS = (getattr(mujoco.mjtStage, f"mjSTAGE_{name}").value for name in ("NONE", "POS", "VEL"))
 WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
+_ONE_SIDE = 1e-7  # of differences to one side: their error is in proportion
 # How the names of model arrays and inputs end that move surfaces.
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
@@ -135,6 +136,33 @@ class Worker:
             self.surfaces = Surfaces(self.model, self.levers)
             self.far, self.stepper = mujoco.MjData(self.surfaces.model), Stepper(self.model, self.layout, 1)
         self.surfaces.widen(speeds if gradient == "slope" else 0 * speeds)
+
+    @np.errstate(invalid="ignore", over="ignore")
+    def differences(self, model: mujoco.MjModel, row: np.ndarray, found: _Found, num_steps: int) -> bool:
+        """Write the end of a motion and its differences by state and held controls, all in C; return whether they are right.
+
+        `mjd_transitionFD` is not where forces by controls change the integrator's matrix, and at surfaces, where it is steep.
+        """
+        self._use(model, np.zeros((0, self.layout.nv)), "discrete")
+        if self.inverse.is_coupled or not self.is_explicit:
+            return False
+        data, size = self.inverse.data, self.layout.num_changes
+        A, B = np.zeros((num_steps, size, size)), np.zeros((num_steps, size, self.model.nu))
+        mujoco.mj_setState(self.model, data, row, EVERY)
+        for by_state, by_control in zip(A, B, strict=True):
+            mujoco.mjd_transitionFD(self.model, data, _ONE_SIDE, False, by_state, by_control, None, None)
+            mujoco.mj_step(self.model, data)
+        matrix = np.eye(size, size + self.model.nu)
+        for by_state, by_control in zip(A, B, strict=True):
+            matrix = by_state @ matrix
+            matrix[:, size:] += by_control
+        mujoco.mj_getState(self.model, data, end := np.empty_like(row), EVERY)
+        found["state"][:], found["ctrl"][:], found["end"][:] = (
+            matrix[:, :size],
+            matrix[:, size:],
+            end[self.layout.motion],
+        )
+        return bool(np.isfinite(end).all() and self._steepness(A) <= _STEEP / self.model.opt.timestep)
 
     def _together(self, steps: Steps, index: list[int]) -> None:
         """Write the derivatives of rows of one model: differences one by one, the algebra at once."""
@@ -395,11 +423,11 @@ class Worker:
             row = layout.moved(row, 8 * change)
         return row
 
-    def _steepness(self, matrix: Float[np.ndarray, "size size"]) -> float:
+    def _steepness(self, matrix: Float[np.ndarray, "... size size"]) -> float:
         """Return the largest change of a velocity with a position, both of the farthest points that they move (1/s)."""
         lengths = self.surfaces.lengths
         nv = len(lengths)
-        return np.abs(matrix[nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(initial=0.0)
+        return np.abs(matrix[..., nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(initial=0.0)
 
     @np.errstate(invalid="ignore", over="ignore", divide="ignore")
     def sense(self, steps: Steps, index: list[int]) -> None:

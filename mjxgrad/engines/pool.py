@@ -292,7 +292,35 @@ class Pool:
     def product(
         self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str, wanted: tuple[str, ...]
     ) -> dict[str, np.ndarray]:
-        """Return the derivative of the end of a motion by its start and inputs held all the time, and "end", the state there."""
+        """Return the derivative of the end of a motion by its start and inputs held all the time, and "end", the state there.
+
+        MuJoCo's own differences are taken where they are right, see `Worker.differences`: they are five times faster.
+        """
+        if gradient == "slope" or wanted != ("ctrl",):
+            return self._composed(numbers, start, inputs, gradient=gradient, wanted=wanted)
+        with self.lock, collected():
+            batch, *given = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
+            (num, steps), size = given[2]["ctrl"].shape[:2], self.layout.num_changes
+            models = [self._exact(model) for model in self._models(given[0], num)]
+            rows = self._rows(given[1] | {name: value[:, 0] for name, value in given[2].items()})
+            found = {"state": np.zeros((num, size, size)), "ctrl": np.zeros((num, size, self.mj_model.nu))}
+            found["end"], is_right = rows[:, self.layout.motion], np.zeros(num, bool)
+
+            def work(worker: Worker, piece: list[int]) -> None:
+                for i in piece:
+                    is_right[i] = worker.differences(models[i], rows[i], {k: x[i] for k, x in found.items()}, steps)
+
+            self._share(work, self.workers, num)
+        for i in np.flatnonzero(~is_right):
+            parts = (_part(slice(i, i + 1), num, one) for one in given)
+            for name, value in self._composed(*parts, gradient=gradient, wanted=wanted).items():
+                found[name][i] = value[0]
+        return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
+
+    def _composed(
+        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str, wanted: tuple[str, ...]
+    ) -> dict[str, np.ndarray]:
+        """Return the same from the derivatives of single steps."""
         steps = np.shape(inputs["ctrl"])[-2]
         after = self.run(numbers, start, inputs)
         before = self._before(start, after)

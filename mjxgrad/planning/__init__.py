@@ -2,7 +2,7 @@
 
 from mjxgrad.planning.controller import Controller
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
-from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, SceneSystem, System
+from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, LeastSquares, SceneSystem, System
 from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
 from mjxgrad.planning.tree import Tree, TreePath
 
@@ -14,6 +14,7 @@ __all__ = [
     "FunctionSystem",
     "GoalCost",
     "Iterations",
+    "LeastSquares",
     "LinearModel",
     "Plan",
     "Sampled",

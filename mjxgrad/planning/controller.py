@@ -5,34 +5,42 @@ import itertools
 import time
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from mjxgrad._arrays import whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Exact, Smoother
 from mjxgrad.planning.system import Cost, System, check_problem
-from mjxgrad.planning.trajectory import Course, Problem, Search, checked, iterate, shifted
+from mjxgrad.planning.trajectory import Course, Problem, checked
 from mjxgrad.rollouts import State
+
+PARTS = ("linear models", "backward pass", "rollouts")
+"""Of an iteration, in their order."""
+_KNOTS = 4  # of a random change of a plan
+_FADING = 0.8  # of what a part is expected to take, if it took less
 
 
 class Controller(Printed):
     """Choose controls by planning anew in each step of a system.
 
-    A decision begins at the last plan, shifted by one step, and takes a few iterations of `optimise_trajectory`. It looks at
-    the clock between them, and keeps its deadline with the best plan so far. One program is compiled, when the controller is
-    made. `print` shows the rate and the missed deadlines.
+    A decision begins at the last plan, shifted by one step, and takes a few iterations of `optimise_trajectory`. It looks at the
+    clock between their parts: where the next one would end after the deadline, it returns the best plan so far, and the next
+    decision goes on from there. Programs are compiled when the controller is made. `print` shows what a decision takes.
 
     Attributes:
         cost: cost of plans; to replace it by one with other numbers, such as a moved goal, compiles nothing.
         deadline: time of a decision (s), or None.
+        price: seconds of each part of a decision, as measured when the controller was made.
         seconds: durations of the decisions since the last reset (s).
-        num_missed: number of decisions that the deadline cut short, or that ended after it.
+        num_cut: number of decisions that the deadline cut short.
+        num_missed: number of decisions that ended after it.
         compile_seconds: duration of the compilation (s).
     """
 
@@ -45,6 +53,8 @@ class Controller(Printed):
         smoother: Smoother = Exact(),
         schedule: Sequence[float] | Float[ArrayLike, " iterations"] = (1.0,),
         first_schedule: Sequence[float] | Float[ArrayLike, " first"] | None = None,
+        num_samples: int = 0,
+        stddev: ArrayLike = 0.1,
         deadline: float | None = None,
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
@@ -58,41 +68,76 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            deadline: the time of a decision (s); one iteration is taken at least.
+            num_samples: plans with random changes that are tried beside the step lengths: they find what derivatives do not
+                see, such as a touch from afar.
+            stddev: standard deviation of these changes, in units of the controls, a number or one per control. Each plan has
+                a share of it, from an eighth to all.
+            deadline: the time of a decision (s); one part of an iteration is taken at least.
             lower: lower limits of the controls.
             upper: upper limits of the controls.
 
         Warns:
-            UserWarning: as `optimise_trajectory`, for a scene in its reference pose.
+            UserWarning: if the deadline is shorter than an iteration; and as `optimise_trajectory`, for the reference pose.
 
         Raises:
-            ValueError: if the deadline is not positive, and as `optimise_trajectory`.
+            ValueError: if a number is out of its range, and as `optimise_trajectory`.
         """
         if deadline is not None and not deadline > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
         check_problem(system, cost)
-        began, origin = time.perf_counter(), system.origin
+        origin, self.num_samples = system.origin, whole("num_samples", num_samples, 0)
         for message in smoother.warnings(system, origin):
             warnings.warn(message, stacklevel=2)
         both = (schedule if first_schedule is None else first_schedule, schedule)
         given = [checked(system, origin, controls, np.asarray(one), lower, upper) for one in both]
         self._schedules, self._origin = [np.asarray(factors) for _, factors, *_ in given], np.asarray(origin)
         start, _, *limits = given[0]
+        self.stddev = np.broadcast_to(np.asarray(stddev, self._origin.dtype), (system.num_controls,))
         problem = Problem(system, cost, smoother, jax.random.split(jax.random.key(0), len(start)), *limits)
-        self.system, self.cost, self.deadline, self._none = system, cost, deadline, problem.begin(origin, start)
-        numbers, one = eqx.filter(cost, eqx.is_inexact_array_like), self._schedules[0][0]
-        lowered = jax.jit(_iteration(problem)).lower(numbers, self._none, self._origin, *_inputs(one, one))
-        self._iterate, self.compile_seconds = lowered.compile(), time.perf_counter() - began
+        self.system, self.cost, self.deadline = system, cost, deadline
+        self._compile(problem, start)
+        self._measure()
+        if deadline is not None and (least := sum(self.price.values()) / len(self._schedules[1])) > deadline:
+            warnings.warn(self._too_short(least), stacklevel=2)
+
+    def _compile(self, problem: Problem, controls: Array) -> None:
+        """Compile the three parts, at once."""
+        began, number = time.perf_counter(), self._schedules[0][0]
+        numbers, rest = eqx.partition(self.cost, eqx.is_inexact_array_like)
+        self._blank = jax.tree.map(np.asarray, problem.begin(self.system.origin, controls))
+        of = lambda numbers: dataclasses.replace(problem, cost=eqx.combine(numbers, rest))  # noqa: E731
+        parts = (
+            lambda numbers, search, factor, *_: of(numbers).linearised(search, factor),
+            lambda numbers, search, *_: of(numbers).solved(search),
+            lambda numbers, search, _, *given: of(numbers).chosen(search, *given)[0],
+        )
+        given = numbers, self._blank, number, number, np.bool_(True), self._noise(0)
+        lowered = [jax.jit(part).lower(*given) for part in parts]
+        with ThreadPoolExecutor(len(PARTS)) as threads:
+            self._programs = dict(zip(PARTS, threads.map(lambda one: one.compile(), lowered), strict=True))
+        self.compile_seconds = time.perf_counter() - began
+
+    def _measure(self) -> None:
+        """Measure the parts of a decision, the least of three: what a first one prepares is kept."""
+        self.price, found = {}, []
+        self.reset()
+        for _ in range(3):
+            self(self._origin)
+            found.append(dict(self._last))
+        num = len(self._schedules[1])
+        self.price = {part: num * min(seconds[part] for seconds in found) for part in PARTS}
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan and the counts; the next decision is a first one."""
-        self._search, self._expected, self.num_missed = self._none, 0.0, 0
+        self._search, self._next, self.num_missed, self.num_cut = self._blank, 0, 0, 0
+        self._last = {part: self.price.get(part, 0.0) / len(self._schedules[1]) for part in PARTS}
+        self._expected = dict(self._last)
         self.seconds: list[float] = []
 
     @property
     def plan(self) -> Course:
-        """The present plan; its cost is infinite if its states are not finite."""
+        """The present plan; its cost is infinite if its states are not finite, or where it was not computed in time."""
         return self._search.best
 
     def __call__(self, state: State | mujoco.MjData | Float[ArrayLike, " state"]) -> Float[np.ndarray, " m"]:
@@ -101,28 +146,63 @@ class Controller(Printed):
         Args:
             state: the present state: a vector of the system, or for a scene its `State` or C MuJoCo's data.
 
+        Warns:
+            UserWarning: in the first decision, if no control moves what has a cost.
+
         Raises:
             ValueError: if the state has another size than the system's, or is not finite.
         """
-        start, is_first = self._vector(state), not self.seconds
-        limit = np.inf if self.deadline is None or is_first else self.deadline
-        factors, began, is_cut = self._schedules[0 if is_first else 1], time.perf_counter(), False
-        if is_first:
-            self._advance(start, *_inputs(factors[0], factors[0], is_first=True))
-        for number, (factor, following) in enumerate(itertools.pairwise([*factors, factors[-1]])):
+        start, is_first, began = self._vector(state), not self.seconds, time.perf_counter()
+        limit = np.inf if self.deadline is None or is_first or not self.price else self.deadline
+        self._begin(start, is_first)
+        factors = self._schedules[0 if is_first else 1]
+        turns = [(*both, part) for both in itertools.pairwise([*factors, factors[-1]]) for part in PARTS][self._next :]
+        for number, (factor, following, part) in enumerate(turns):
             before = time.perf_counter()
-            # An iteration is expected to last as long as the one before it.
-            if is_cut := number > 0 and before - began + self._expected > limit:
+            is_cut = number > 0 and before - began + self._expected[part] > limit
+            self._next = PARTS.index(part) if is_cut else 0
+            if is_cut:
+                self.num_cut += 1
                 break
-            self._advance(start, *_inputs(factor, following, is_shifted=number == 0 and not is_first))
-            self._expected = time.perf_counter() - before
+            self._advance(part, factor, following)
         self.seconds.append(time.perf_counter() - began)
-        self.num_missed += is_cut or self.seconds[-1] > limit
+        self.num_missed += self.seconds[-1] > limit
+        if is_first and self._search.unmoved.any() and self.price:
+            warnings.warn(self._untouched(), stacklevel=2)
         return np.array(self.plan.controls)[0]
 
-    def _advance(self, start: np.ndarray, *inputs: np.generic) -> None:
-        numbers = eqx.filter(self.cost, eqx.is_inexact_array_like)
-        self._search = jax.block_until_ready(self._iterate(numbers, self._search, start, *inputs))
+    def _begin(self, start: np.ndarray, is_first: bool) -> None:
+        """Shift all by a step, to the present state; the first time compute the course of the given controls."""
+        later = lambda x: np.concatenate([x[1:], x[-1:]]) if np.ndim(x) else x  # noqa: E731
+        # The new course of the shifted plan is not computed: the feedback law around the old one takes the difference.
+        horizon, search = len(self._blank.law.change), self._search
+        if not is_first:
+            parts = {name: jax.tree.map(later, getattr(search, name)) for name in ("best", "models", "law")}
+            search = dataclasses.replace(search, **parts)
+        states = np.tile(start, (horizon + 1, 1)) if is_first else search.best.states
+        states[0] = start
+        course = Course(states, search.best.controls, np.full_like(search.best.cost, np.inf))  # pyright: ignore
+        self._search = dataclasses.replace(search, course=course, best=course)
+        if is_first:
+            self._advance("rollouts", *2 * [self._schedules[0][0]], is_first=True)
+
+    def _advance(self, part: str, factor: np.generic, following: np.generic, *, is_first: bool = False) -> None:
+        """Run a part of an iteration; its time is what the next is expected to take."""
+        began, numbers = time.perf_counter(), eqx.filter(self.cost, eqx.is_inexact_array_like)
+        given = factor, following, np.bool_(is_first), self._noise(len(self.seconds))
+        self._search = jax.tree.map(np.asarray, self._programs[part](numbers, self._search, *given))
+        self._last[part] = time.perf_counter() - began
+        self._expected[part] = max(self._last[part], _FADING * self._expected[part])
+
+    def _noise(self, seed: int) -> Float[np.ndarray, "N horizon m"]:
+        """Return changes of the controls that are linear between four of them, each plan's larger than the last one's."""
+        horizon, size = self._blank.course.controls.shape
+        knots = np.random.default_rng(seed).normal(size=(self.num_samples, min(_KNOTS, horizon), size)) * self.stddev
+        at = np.linspace(0, knots.shape[1] - 1, horizon)
+        low = np.minimum(at.astype(int), max(knots.shape[1] - 2, 0))
+        share = (at - low)[:, None]
+        noise = (1 - share) * knots[:, low] + share * knots[:, np.minimum(low + 1, knots.shape[1] - 1)]
+        return (np.geomspace(0.125, 1, self.num_samples)[:, None, None] * noise).astype(self._origin.dtype)
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
         parts = [getattr(state, name) for name in ("qpos", "qvel", "act")] if hasattr(state, "qpos") else [state]
@@ -133,31 +213,36 @@ class Controller(Printed):
             raise ValueError(f"state must be finite, got {vector.tolist()}")
         return vector
 
+    def _too_short(self, least: float) -> str:
+        assert self.deadline is not None
+        told = f"an iteration takes about {_ms(least)}, longer than the deadline of {_ms(self.deadline)}, and is spread over some"
+        steps = int(len(self._blank.course.controls) * self.deadline / least)
+        return f"{told} decisions: take a deadline of {_ms(1.2 * least)}, or a plan of {max(steps, 1)} steps"
+
+    def _untouched(self) -> str:
+        places = np.flatnonzero(self._search.unmoved)
+        told = f"no control moves {self.system.named(places)}, which has a cost: where nothing touches, derivatives are zero"
+        helps = "add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take num_samples=16"
+        return f"{told}; {helps}"
+
     def __str__(self) -> str:
-        rate = f"{format_number(1 / float(np.median(self.seconds or [np.inf])))} Hz in the median"
-        missed = f", {self.num_missed} missed {format_number(1e3 * self.deadline)} ms" if self.deadline else ""
-        is_idle = self.seconds and np.array_equal(self.plan.controls, self._none.best.controls)
-        idle = ". Controls are as given, since no small change lowers the cost: begin with others" if is_idle else ""
-        return f"{len(self.seconds)} decisions, {rate}{missed}; compiled once, in {self.compile_seconds:.1f} s{idle}"
+        price, parts = sum(self.price.values()), ", ".join(f"{part} {1e3 * x:.0f}" for part, x in self.price.items())
+        told = f"A decision takes about {_ms(price)} ({format_number(1 / price)} Hz): {parts}"
+        told += f"; compiled in {self.compile_seconds:.1f} s"
+        if not self.seconds:
+            return told
+        rate = f"{format_number(1 / float(np.median(self.seconds)))} Hz in the median"
+        missed = f", {self.num_missed} missed {_ms(self.deadline)}, {self.num_cut} cut short" if self.deadline else ""
+        idle = ""
+        if np.array_equal(self.plan.controls, self._blank.best.controls):
+            why = (
+                self._untouched()
+                if self._search.unmoved.any()
+                else "no small change lowers the cost: begin with others"
+            )
+            idle = f". Controls are as given, since {why}"
+        return f"{len(self.seconds)} decisions, {rate}{missed}. {told}{idle}"
 
 
-def _inputs(factor: Any, following: Any, *, is_first: bool = False, is_shifted: bool = False) -> tuple[np.generic, ...]:
-    """Return the last arguments of an iteration, as NumPy's numbers: JAX would compile a program to make its own."""
-    return factor, following, np.bool_(is_first), np.bool_(is_shifted)
-
-
-def _iteration(problem: Problem):
-    """Return the program of an iteration: of given controls the first, which computes their course, or of a shifted plan."""
-    rest = eqx.filter(problem.cost, eqx.is_inexact_array_like, inverse=True)
-
-    def run(numbers: Cost, search: Search, start, factor, following, is_first, is_shifted) -> Search:
-        one, plan = dataclasses.replace(problem, cost=eqx.combine(numbers, rest)), search.best
-        fresh = one.begin(start, shifted(plan, jnp.where(is_shifted, 1, 0)))
-        # The new course of the shifted plan is not computed: the feedback law around the old one takes the difference.
-        states = jnp.concatenate([start[None], plan.states[2:], plan.states[-1:]])
-        course = Course(jnp.where(is_first, fresh.course.states, states), fresh.course.controls, fresh.course.cost)
-        fresh = dataclasses.replace(fresh, course=course)
-        search = jax.tree.map(lambda new, old: jnp.where(is_first | is_shifted, new, old), fresh, search)
-        return iterate(one, search, factor, following, is_first)[0]
-
-    return run
+def _ms(seconds: float) -> str:
+    return f"{format_number(1e3 * seconds)} ms"

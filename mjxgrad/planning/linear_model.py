@@ -37,6 +37,7 @@ from mjxgrad._arrays import is_known, known, whole
 from mjxgrad._text import name_pairs
 from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System
 from mjxgrad.stepping import Smoothing
+from mjxgrad.stepping.smoothing import Mode
 
 _Samples = Float[Array, "N both"]
 _Changes = Float[Array, " both"]
@@ -50,8 +51,8 @@ class LinearModel(eqx.Module):
         B: derivative of the next state's change by the control.
     """
 
-    A: Float[Array, "n n"]
-    B: Float[Array, "n m"]
+    A: Float[Array, "*steps n n"]
+    B: Float[Array, "*steps n m"]
 
 
 class Smoother(eqx.Module):
@@ -79,6 +80,8 @@ class Smoother(eqx.Module):
 class Analytic(Smoother):
     """Contacts averaged in the solver, without sampling: the result does not depend on the key.
 
+    Where C MuJoCo steps the scene, its margins are widened instead, so that nothing is compiled: see `SceneSystem.widened`.
+
     Attributes:
         smoothing: smoothing of contacts and limits; None is the system itself.
     """
@@ -86,22 +89,27 @@ class Analytic(Smoother):
     smoothing: Smoothing | None
 
     def step(self, system, state, control, key):
-        return self._smoothed(system).step(state, control)
+        return self._smoothed(system, "forward").step(state, control)
 
     def linear_model(self, system, state, control, key):
-        end, jacobian = _linearised(system := self._smoothed(system), state, control)
+        end, jacobian = _linearised(system := self._smoothed(system, "backward"), state, control)
         exists = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(end))
         return LinearModel(*jnp.split(jnp.where(exists, jacobian, jnp.nan), [system.num_changes], axis=1))
 
     def native(self, system: System) -> SceneSystem | None:
         """Return the system to be stepped if its engine takes a whole trajectory in one call; otherwise None."""
-        return _native(self._smoothed(system))
+        return _native(self._smoothed(system, "forward"))
 
-    def _smoothed(self, system: System) -> System:
-        return system if self.smoothing is None else system.with_contact(self.smoothing)
+    def _smoothed(self, system: System, mode: Mode) -> System:
+        if self.smoothing is None:
+            return system
+        if _native(system) is None:
+            return system.with_contact(self.smoothing)
+        # Smoothing of the backward pass alone is in the linear models alone.
+        return system.widened(self.smoothing.length) if self.smoothing.mode in ("forward", mode) else system
 
     def warnings(self, system: System, start: StateVector) -> list[str]:
-        if self.smoothing is None or not isinstance(system, SceneSystem):
+        if self.smoothing is None or not isinstance(system, SceneSystem) or system.engine.steers:
             return []
         given, pairs = system.scene.model, [pair for pair in system.scene.pairs if pair.condim > 1]
         if not all(is_known(x) for x in (start, given.geom_size, given.body_pos, given.geom_pos)):

@@ -11,12 +11,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from mjxgrad._arrays import instance, known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
-from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.bodies.kinematics import integrate_position, kinematics, position_change
 from mjxgrad.engines import Engine, engine_of
 from mjxgrad.engines.state import check_scene
 from mjxgrad.objective.task import as_pytree
@@ -27,6 +29,8 @@ from mjxgrad.stepping import Contact, Discrete, check_contact
 StateVector = Float[Array, " state"]
 ControlVector = Float[Array, " m"]
 ChangeVector = Float[Array, " n"]
+_REACH = 4.0  # lengths
+_ALONE = 1e6  # of a geom's weight beside another's, so that its impedance is that of the contact
 _Jacobian = Float[Array, "n both"]
 
 
@@ -57,6 +61,10 @@ class System(eqx.Module):
     def difference(self, end: StateVector, start: StateVector) -> ChangeVector:
         """Return the change that moves `start` to `end`; the inverse of `retract`."""
         return end - start
+
+    def named(self, coordinates: Int[np.ndarray, " some"]) -> str:
+        """Return the names of coordinates of a change."""
+        return f"coordinates {coordinates.tolist()} of the state"
 
     def __hash__(self) -> int:
         # `jax.jit(system.step)` needs a hash, and arrays have none.
@@ -151,6 +159,16 @@ class SceneSystem(System):
         qvel = state[nq : nq + nv]
         return State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
 
+    def named(self, coordinates: Int[np.ndarray, " some"]) -> str:
+        model = self.scene.mj_model
+        joints = [model.joint(int(model.dof_jntid[k % model.nv])).name for k in coordinates if k < 2 * model.nv]
+        names = ", ".join(repr(name) for name in dict.fromkeys(joints) if name)
+        return f"{names or 'some'} ({super().named(coordinates)})"
+
+    def placed(self, state: StateVector) -> mjx.Data:
+        """Return data that has the places of bodies, geoms and sites in a state, such as `site_xpos`, for costs."""
+        return kinematics(self.scene.model, self.scene.data.replace(qpos=state[: self.scene.model.nq]))
+
     @compiled
     def step(self, state: StateVector, control: ControlVector) -> StateVector:
         given = self.scene, self._unflattened(state), control, self.num_substeps, self.contact
@@ -165,6 +183,28 @@ class SceneSystem(System):
         nq = self.scene.model.nq
         moved = position_change(self.scene.model, start[:nq], end[:nq])
         return jnp.concatenate([moved, end[nq:] - start[nq:]])
+
+    def widened(self, length: ArrayLike) -> "SceneSystem":
+        """Return the system with contacts that act from a distance, by C MuJoCo's margins.
+
+        The force rises from nothing at four lengths (m), where that of normal noise has all but vanished. Geoms that touch what
+        is fixed, in the reference pose, are as they were: what stands on the floor would else hover.
+        """
+        model, given = self.scene.mj_model, self.scene.model
+        mujoco.mj_fwdPosition(model, data := mujoco.MjData(model))
+        is_fixed, pairs = model.body_weldid[model.geom_bodyid] == 0, np.reshape(data.contact.geom, (-1, 2)).astype(int)
+        is_wide = ~is_fixed
+        is_wide[pairs[is_fixed[pairs].any(axis=1)]] = False
+        reach = _REACH * jnp.asarray(length)
+        solimp = given.geom_solimp.at[:, 2].set(reach).at[:, jnp.array([0, 3, 4])].set(jnp.array([1e-4, 0.9, 3.0]))
+        return dataclasses.replace(
+            self,
+            scene=self.scene.with_model(
+                geom_margin=jnp.where(is_wide, given.geom_margin + reach, given.geom_margin),
+                geom_solimp=jnp.where(is_wide[:, None], solimp, given.geom_solimp),
+                geom_solmix=jnp.where(is_wide, _ALONE * given.geom_solmix, given.geom_solmix),
+            ),
+        )
 
     def with_contact(self, contact: Contact) -> "SceneSystem":
         check_contact(contact, is_step=True)
@@ -196,7 +236,25 @@ def check_problem(system: Any, cost: Any) -> None:
     instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
 
 
-class GoalCost(Cost):
+class LeastSquares(Cost):
+    """Half the sum of squared residuals. Its linear-quadratic models need first derivatives alone, and are soon compiled."""
+
+    @abstractmethod
+    def residuals(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, " residuals"]:
+        """Return the residuals of one step."""
+
+    @abstractmethod
+    def terminal_residuals(self, system: System, state: StateVector) -> Float[Array, " residuals"]:
+        """Return the residuals of the last state."""
+
+    def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
+        return 0.5 * jnp.sum(self.residuals(system, state, control) ** 2)
+
+    def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
+        return 0.5 * jnp.sum(self.terminal_residuals(system, state) ** 2)
+
+
+class GoalCost(LeastSquares):
     """Weighted squared distances to a goal and squared controls, each with a factor of one half.
 
     Attributes:
@@ -217,23 +275,23 @@ class GoalCost(Cost):
             if weight is not None and not (weight >= 0).all():
                 raise ValueError(f"{name} must be at least 0, got {weight}")
 
-    def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
+    def residuals(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, " residuals"]:
         away = self._weighted("stage_weight", self._away(system, state))
-        return 0.5 * (away + self._weighted("control_weight", control))
+        return jnp.concatenate([away, self._weighted("control_weight", control)])
 
-    def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
-        return 0.5 * self._weighted("terminal_weight", self._away(system, state))
+    def terminal_residuals(self, system: System, state: StateVector) -> Float[Array, " residuals"]:
+        return self._weighted("terminal_weight", self._away(system, state))
 
     def _away(self, system: System, state: StateVector) -> Float[Array, " changes"]:
         if self.goal.shape != state.shape:
             raise ValueError(f"goal must be a state of this system, of shape {state.shape}, got {self.goal.shape}")
         return system.difference(state, self.goal)
 
-    def _weighted(self, name: str, change: Float[Array, " size"]) -> Float[Array, ""]:
+    def _weighted(self, name: str, change: Float[Array, " size"]) -> Float[Array, " size"]:
         weight = getattr(self, name)
         if weight.shape not in ((), change.shape):
             raise ValueError(f"{name} must be one number or have shape {change.shape}, got {weight.shape}")
-        return jnp.sum(weight * change**2)
+        return jnp.sqrt(weight) * change
 
 
 class Quadratic(eqx.Module):
@@ -245,23 +303,28 @@ class Quadratic(eqx.Module):
 
 def stage_model(cost: Cost, system: System, state: StateVector, control: ControlVector) -> Quadratic:
     """Return the expansion of the cost of a step around a state and a control."""
-    n = system.num_changes
-
-    def moved(change: Float[Array, " both"]) -> Float[Array, ""]:
-        return cost.stage(system, system.retract(state, change[:n]), control + change[n:])
-
+    n, function = system.num_changes, cost.residuals if isinstance(cost, LeastSquares) else cost.stage
+    moved = lambda change: function(system, system.retract(state, change[:n]), control + change[n:])  # noqa: E731
     return _model(moved, jnp.zeros(n + control.size, state.dtype))
 
 
 def terminal_model(cost: Cost, system: System, state: StateVector) -> Quadratic:
     """Return the expansion of the terminal cost around the last state."""
-    at = jnp.zeros(system.num_changes, state.dtype)
-    return _model(lambda change: cost.terminal(system, system.retract(state, change)), at)
+    function = cost.terminal_residuals if isinstance(cost, LeastSquares) else cost.terminal
+    return _model(
+        lambda change: function(system, system.retract(state, change)), jnp.zeros(system.num_changes, state.dtype)
+    )
 
 
-def _model(function, at: Float[Array, " both"]) -> Quadratic:
-    """Return gradient and Hessian with negative curvature removed, which would turn descent into ascent."""
-    if shape := jax.eval_shape(function, at).shape:
+def _model(function: Callable[[Array], Array], at: Float[Array, " both"]) -> Quadratic:
+    """Return the expansion of a number or, by Gauss and Newton, of residuals.
+
+    Negative curvature is removed, which would turn descent into ascent.
+    """
+    if len(shape := jax.eval_shape(function, at).shape) == 1:
+        value, jacobian = function(at), jax.jacfwd(function)(at)
+        return Quadratic(jacobian.T @ value, jacobian.T @ jacobian)
+    if shape:
         raise ValueError(f"stage and terminal of a cost must return one number each, got shape {shape}")
     hessian = jax.hessian(function)(at)
     values, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))

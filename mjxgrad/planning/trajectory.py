@@ -1,5 +1,6 @@
 """Trajectory optimisation on smoothed linear models, whose smoothing decreases as the plan improves."""
 
+import dataclasses
 import functools
 import warnings
 
@@ -27,14 +28,15 @@ from mjxgrad.rollouts.rollout import sequence_of
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]
+_Held = Array | np.ndarray  # on the host a search is held as NumPy's arrays
 _Matrix = Float[Array, "m m"]
 _Controls = Float[Array, "horizon m"]
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
 _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
 # A plan has converged once its model predicts to lower the cost by no more than this share of it.
 _TOLERANCE = 1e-4
-# An influence of controls on a coordinate counts as zero below this many rounding units of the largest influence.
-_ROUNDINGS = 100
+# An influence of controls on a coordinate counts as zero below this share of the largest influence: roundings of differences.
+_INFLUENCE = 1e-5
 # Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
@@ -114,24 +116,26 @@ class Feedback(eqx.Module):
 
 
 class Course(eqx.Module):
-    """A trajectory, its controls and its cost."""
+    """A trajectory, its controls and its cost; on the host of NumPy's arrays."""
 
-    states: Float[Array, "states state"]
-    controls: _Controls
-    cost: _Scalar
+    states: Float[_Held, "states state"]
+    controls: Float[_Held, "horizon m"]
+    cost: Float[_Held, ""]
 
 
 class Search(eqx.Module):
-    """The state of the search between iterations: its course, the best one without smoothing, and the unmoved coordinates."""
+    """The state of the search between iterations: its course, the best one without smoothing, and what is known around it."""
 
     course: Course
     best: Course
-    regularisation: _Scalar
-    unmoved: Bool[Array, " n"]
+    regularisation: Float[_Held, ""]
+    models: LinearModel
+    law: Feedback
+    unmoved: Bool[_Held, " n"]
 
 
 class Problem(eqx.Module):
-    """The constants of all iterations."""
+    """The constants of all iterations, and the three parts of one."""
 
     system: System
     cost: Cost
@@ -142,15 +146,16 @@ class Problem(eqx.Module):
 
     def begin(self, start: StateVector, controls: _Controls) -> Search:
         """Return the search before its first iteration."""
-        at_start = jnp.broadcast_to(start, (len(controls) + 1, *start.shape))
-        unknown = jnp.asarray(jnp.inf, start.dtype)
-        given = Course(at_start, jnp.clip(controls, self.lower, self.upper), unknown)
-        least = jnp.asarray(_LEAST_REGULARISATION, start.dtype)
-        return Search(given, given, least, jnp.zeros(self.system.num_changes, bool))
+        at_start, (horizon, m), n = jnp.tile(start, (len(controls) + 1, 1)), controls.shape, self.system.num_changes
+        zeros = functools.partial(jnp.zeros, dtype=start.dtype)
+        given = Course(at_start, jnp.clip(controls, self.lower, self.upper), zeros(()) + jnp.inf)
+        models = LinearModel(zeros((horizon, n, n)), zeros((horizon, n, m)))
+        law = Feedback(zeros((horizon, m)), zeros((horizon, m, n)), zeros(()), jnp.asarray(True))
+        return Search(given, given, zeros(()) + _LEAST_REGULARISATION, models, law, jnp.zeros(n, bool))
 
-    def run(self, smoother: Smoother, course: Course, law: Feedback, step: ArrayLike) -> Course:
-        """Follow a course under a feedback law; a step of zero repeats its controls."""
-        follows = jnp.asarray(step) > 0
+    def run(self, smoother: Smoother, course: Course, law: Feedback, step: ArrayLike, noise: ArrayLike = 0.0) -> Course:
+        """Follow a course under a feedback law; a step of zero repeats its controls, to which noise is added."""
+        follows, course = jnp.asarray(step) > 0, dataclasses.replace(course, controls=course.controls + noise)
 
         def advance(state, inputs):
             nominal, control, change, gain, key = inputs
@@ -171,15 +176,40 @@ class Problem(eqx.Module):
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
-    def law(self, smoother: Smoother, course: Course, regularisation: _Scalar):
-        """Return the feedback law around a course, and the unmoved coordinates."""
-        system, cost, states, controls = self.system, self.cost, course.states, course.controls
-        models = jax.vmap(lambda *at: smoother.linear_model(system, *at))(states[:-1], controls, self.keys)
-        stages = jax.vmap(lambda *at: stage_model(cost, system, *at))(states[:-1], controls)
-        terminal = terminal_model(cost, system, states[-1])
-        low, high = self.lower - controls, self.upper - controls
-        law = backward_pass(models, stages, terminal, low, high, regularisation)
-        return law, _unmoved(models, stages, terminal, course.cost)
+    def linearised(self, search: Search, factor: _Scalar) -> Search:
+        """Take the linear models of all steps of the course."""
+        course, linear_model = search.course, functools.partial(self.smoother.scaled(factor).linear_model, self.system)
+        models = jax.vmap(linear_model)(course.states[:-1], course.controls, self.keys)
+        return dataclasses.replace(search, models=models)
+
+    def solved(self, search: Search) -> Search:
+        """Take the feedback law of the linear-quadratic problem, and the unmoved coordinates."""
+        system, cost, course, models = self.system, self.cost, search.course, search.models
+        stages = jax.vmap(lambda *at: stage_model(cost, system, *at))(course.states[:-1], course.controls)
+        terminal = terminal_model(cost, system, course.states[-1])
+        limits = self.lower - course.controls, self.upper - course.controls
+        law = backward_pass(models, stages, terminal, *limits, search.regularisation)
+        return dataclasses.replace(search, law=law, unmoved=_unmoved(models, stages, terminal, course.cost))
+
+    def chosen(
+        self, search: Search, following: _Scalar, is_first: Bool[Array, ""], noise: Float[Array, "N horizon m"]
+    ) -> tuple[Search, _Scalar, _Scalar]:
+        """Take the best of several step lengths and samples, at first the given controls; add its true cost and its step."""
+        smoother, law, dtype = self.smoother.scaled(following), search.law, search.course.states.dtype
+        steps = jnp.pad(jnp.array((0.0, *_STEPS), dtype), (0, len(noise)))
+        added = jnp.pad(noise.astype(dtype), ((len(steps) - len(noise), 0), (0, 0), (0, 0)))
+        tried = jax.vmap(lambda *at: self.run(smoother, search.course, law, *at))(steps, added)
+        is_valid = (jnp.arange(len(steps)) == 0) | (~is_first & (law.is_sound | (steps == 0)))
+        index = jnp.argmin(jnp.where(is_valid, tried.cost, jnp.inf))
+        course = jax.tree.map(lambda x: x[index], tried)
+        is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None
+        true = course if is_exact else self.run(Exact(), course, law, 0.0)
+        is_better = is_first | (true.cost < search.best.cost)
+        best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
+        # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
+        change = jnp.where(is_first, 1.0, jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0)))
+        after = jnp.clip(change * search.regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
+        return dataclasses.replace(search, course=course, best=best, regularisation=after), true.cost, steps[index]
 
 
 def optimise_trajectory(
@@ -284,28 +314,10 @@ def iterate(
     problem: Problem, search: Search, factor: _Scalar, following: _Scalar, is_first: Bool[Array, ""]
 ) -> tuple[Search, Iterations]:
     """Take one iteration under a factor of the smoothing; the first one computes the course of the given controls alone."""
-    smoother, course, zeros = problem.smoother, search.course, functools.partial(jnp.zeros, dtype=problem.lower.dtype)
-    gains = (*course.controls.shape, problem.system.num_changes)
-    nothing = Feedback(zeros(course.controls.shape), zeros(gains), zeros(()), jnp.asarray(True))
-    law, unmoved = jax.lax.cond(
-        is_first,
-        lambda: (nothing, search.unmoved),
-        lambda: problem.law(smoother.scaled(factor), course, search.regularisation),
-    )
-    steps = jnp.array((0.0, *_STEPS), course.states.dtype)
-    tried = jax.vmap(lambda step: problem.run(smoother.scaled(following), course, law, step))(steps)
-    index = jnp.where(law.is_sound & ~is_first, jnp.argmin(tried.cost), 0)
-    course = jax.tree.map(lambda x: x[index], tried)
-    is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None
-    true = course if is_exact else problem.run(Exact(), course, law, 0.0)
-    is_better = is_first | (true.cost < search.best.cost)
-    best = jax.tree.map(lambda new, old: jnp.where(is_better, new, old), true, search.best)
-    # As in Levenberg-Marquardt: more regularisation where no step lowered the cost, less after a full step.
-    change = jnp.where(index == 0, 8.0, jnp.where(index == 1, 0.25, 1.0))
-    after = jnp.clip(change * search.regularisation, _LEAST_REGULARISATION, _MOST_REGULARISATION)
-    after = jnp.where(is_first, search.regularisation, after)
-    row = Iterations(factor, course.cost, true.cost, steps[index], law.promised)
-    return Search(course, best, after, unmoved), row
+    improved = lambda: problem.solved(problem.linearised(search, factor))  # noqa: E731
+    search = jax.lax.cond(is_first, lambda: search, improved)
+    search, true, step = problem.chosen(search, following, is_first, jnp.zeros((0, *search.course.controls.shape)))
+    return search, Iterations(factor, search.course.cost, true, step, search.law.promised)
 
 
 def shifted(plan: Plan | Course, num_steps: ArrayLike = 1) -> _Controls:
@@ -326,12 +338,16 @@ def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: 
     curvatures = jax.vmap(jnp.diag)(jnp.concatenate([stages.hessian[1:, :n, :n], terminal.hessian[None]]))
     gain = jnp.sum(0.5 * slopes**2 / jnp.where(curvatures > 0, curvatures, 1.0), axis=0)
 
-    def spread(moved, model):
-        A, B = jnp.abs(model[0]), jnp.abs(model[1])
-        return A @ moved + B.sum(axis=1), None
+    # Controls that change all at once, by turns up and down: sums of sizes would grow as the motion does not.
+    signs = jnp.cos(1.0 + jnp.arange(models.B.shape[0] * models.B.shape[2]) ** 2.0).reshape(models.B.shape[0], -1)
 
-    moved, _ = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models.A, models.B))
-    return (gain > _TOLERANCE * jnp.abs(cost)) & (moved <= _ROUNDINGS * jnp.finfo(moved.dtype).eps * jnp.max(moved))
+    def spread(moved, given):
+        model, change = given
+        moved = model.A @ moved + model.B @ change
+        return moved, jnp.abs(moved)
+
+    _, moved = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models, signs.astype(slopes.dtype)))
+    return (gain > _TOLERANCE * jnp.abs(cost)) & (moved.max(axis=0) <= _INFLUENCE * jnp.max(moved))
 
 
 def backward_pass(

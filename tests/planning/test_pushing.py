@@ -1,0 +1,129 @@
+"""A finger pushes a box by receding horizon, judged in C MuJoCo: from several starts, in time, and where it touches nothing."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, LeastSquares, SceneSystem
+
+PUSHER = """<mujoco><option timestep=".005"/><worldbody><geom name="floor" type="plane" size="2 2 .1"/>
+  <body pos="-.15 0 .09"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+    <geom size=".04" mass=".5"/><site name="tip"/></body>
+  <body pos="0 0 .05"><freejoint name="box"/><geom type="box" size=".05 .05 .05" mass=".3"/></body></worldbody><actuator>
+  <position joint="x" kp="100" kv="10" ctrlrange="-1 1"/><position joint="y" kp="100" kv="10" ctrlrange="-1 1"/>
+  </actuator></mujoco>"""
+GOAL, SUBSTEPS = np.array([0.15, 0.03]), 6
+NOTHING = "no control moves 'box' .coordinates .2.* add the distance"
+
+
+class Push(LeastSquares):
+    """The box is to be at its goal; with a weight, the finger behind it."""
+
+    distance: jax.Array
+
+    def terminal_residuals(self, system, state):
+        box, tip = state[2:4], system.placed(state).site_xpos[0, :2]
+        away = GOAL - box
+        behind = box - 0.09 * away / jnp.sqrt(away @ away + 1e-3)
+        return jnp.concatenate([5 * away, self.distance * (tip - behind), 0.2 * state[11:13]])
+
+    def residuals(self, system, state, control):
+        return jnp.concatenate([0.5 * self.terminal_residuals(system, state), 0.05 * state[9:11]])
+
+
+@pytest.fixture(scope="module")
+def system():
+    return SceneSystem(mg.load_scene(PUSHER, engine="mujoco"), num_substeps=SUBSTEPS)
+
+
+@pytest.fixture(scope="module")
+def made(system):
+    return Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)))
+
+
+@pytest.fixture
+def controller(made):
+    made.reset()
+    made.cost, made.deadline = Push(jnp.asarray(1.0)), None
+    return made
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.03, -0.03)])
+def test_a_box_is_pushed_to_its_goal(controller, place):
+    model = mujoco.MjModel.from_xml_string(PUSHER)
+    data = mujoco.MjData(model)
+    data.qpos[2:4] = place
+    for _ in range(100):
+        data.ctrl[:] = controller(data)
+        mujoco.mj_step(model, data, SUBSTEPS)
+    assert np.linalg.norm(data.qpos[2:4] - GOAL) < 0.02
+
+
+def test_where_nothing_is_touched_a_warning_says_what_to_do(controller, system):
+    controller.cost = Push(jnp.asarray(0.0))
+    with pytest.warns(UserWarning, match=NOTHING):
+        controller(np.asarray(system.origin))
+    assert "Controls are as given, since no control moves 'box'" in str(controller)
+
+
+def test_a_deadline_is_kept_where_an_iteration_takes_longer(controller, system, monkeypatch):
+    """Parts of 50 ms and a deadline of 140: two are done in each decision, an iteration in one or two, and the plan improves."""
+
+    def slow(program):
+        return lambda *given: time.sleep(0.05) or program(*given)
+
+    start, costs = np.asarray(system.origin), []
+    monkeypatch.setattr(controller, "_programs", {name: slow(one) for name, one in controller._programs.items()})
+    controller(start)
+    controller.deadline = 0.14
+    for _ in range(15):
+        controller(start)
+        costs.append(controller.plan.cost)
+    assert controller.num_missed <= 2
+    assert controller.num_cut >= 12
+    assert "16 decisions" in str(controller)
+    finite = np.array(costs)[np.isfinite(costs)]
+    assert 4 < len(finite) < 14
+    assert finite[-1] < 0.9 * finite[0]
+
+
+def test_what_a_decision_takes_is_said_before_the_first(controller):
+    assert str(controller).startswith("A decision takes about ")
+    assert all(f"{part} " in str(controller) for part in ("linear models", "backward pass", "rollouts"))
+    controller.price = {"linear models": 0.02, "backward pass": 0.003, "rollouts": 0.0052}
+    assert "28.2 ms (35.5 Hz): linear models 20, backward pass 3, rollouts 5; compiled in" in str(controller)
+
+
+def test_too_short_a_deadline_is_told(system):
+    with pytest.warns(
+        UserWarning, match="longer than the deadline of 0.0001 ms, and is spread over some decisions: take"
+    ):
+        Controller(system, GoalCost(system.origin, 1.0, 1.0, 1.0), jnp.zeros((2, 2)), deadline=1e-7)
+
+
+@pytest.mark.filterwarnings("ignore:no control moves")
+def test_samples_touch_what_derivatives_do_not_see(system):
+    found = Controller(system, Push(jnp.asarray(0.0)), jnp.zeros((12, 2)), num_samples=16, stddev=0.3)
+    for _ in range(3):
+        found(np.asarray(system.origin))
+    assert found.plan.states[-1, 2] > 0.01
+
+
+def test_widened_contacts_of_c_mujoco_act_from_a_distance(system):
+    """The gap is 6 cm: four lengths reach it or do not. What stands on the floor stays there."""
+    state, control = system.origin, jnp.array([0.05, 0.0])
+    far = Analytic(mg.Smoothing(0.03)).linear_model(system, state, control, None)
+    near = Analytic(mg.Smoothing(0.011)).linear_model(system, state, control, None)
+    none = Exact().linear_model(system, state, control, None)
+    assert far.B[8 + 2, 0] > 1e-3
+    np.testing.assert_allclose(near.B, none.B, atol=1e-6)
+    end = Analytic(mg.Smoothing(0.011)).step(system, state, control, None)
+    np.testing.assert_allclose(end, system.step(state, control), atol=1e-6)
+    backward = Analytic(mg.Smoothing(0.03, mode="backward"))
+    np.testing.assert_allclose(backward.step(system, state, control, None), system.step(state, control), atol=1e-9)
+    np.testing.assert_allclose(backward.linear_model(system, state, control, None).B, far.B, atol=1e-6)
