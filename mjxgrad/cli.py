@@ -133,9 +133,7 @@ def check(
     """
     _writable(html, is_page=True)
     log = _timed()
-    log(
-        f"takes up to {10 if quick else budget + 10:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends with what there is"
-    )
+    log(f"takes up to {10 if quick else budget + 10:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)
@@ -212,13 +210,14 @@ def identify(
         recordings: CSV or NPZ files, before the options.
         parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
-            (actuators) and delay. kind:one,other is one value for both.
+            (actuators), delay, and fields of the model: jnt_stiffness:knee, body_pos[2]:shin. kind:one,other is one value
+            for both.
         noise: name=standard deviation, of every measured column, or of qpos, qvel and sensors as a whole. Then the answer says
             whether more than noise is left; by default each signal is weighed by how much it varies.
         held_out: share for validation only: every n-th recording, or the end of a single one.
         start: as the first row says, as noisy as that, and what it lacks is the scene's pose, at rest; exactly this pose, at
             rest; or all unknown, to be found, too.
-        max_steps: largest number of simulations with derivatives; those of many motions without are not counted.
+        max_steps: largest number of derivatives; ensembles of many motions are not counted.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
     """
     _writable(output / "report.html", makes_folder=True, is_page=True)
@@ -244,17 +243,23 @@ def identify(
         motions.append(dataclasses.replace(one, start=mg.initial_state(loaded)) if start == "exact" else one)
     fitted, judged = files.hold_out(motions, held_out)
     several = "s" * (len(fitted) > 1)
-    log(f"{len(wanted)} parameters, {len(fitted)} motion{several} to fit, {len(judged)} held out; compiling")
-    say = lambda step, metrics: log(f"step {step}: error {metrics['rms']:.3g} {unit}")  # noqa: E731
+    log(f"{len(wanted)} parameters, {len(fitted)} motion{several} to fit, {len(judged)} held out")
     given = {"delay": "delay" if "delay" in wanted else None, "free_start": True if start == "free" else None}
+    log(mg.identification.outlook(loaded, wanted, fitted, **given).summary())
+
+    def say(step: int, metrics: dict[str, float]) -> None:
+        part = "" if metrics["share"] == 1 else f" over the first {100 * metrics['share']:.0f} %"
+        log(f"step {step}: error {metrics['rms']:.3g} {unit}{part}, about {metrics['seconds']:.0f} s to go")
+
     result = mg.identify(loaded, wanted, fitted, held_out=judged, max_steps=max_steps, log=say, **given)
-    print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)
     output.mkdir(parents=True, exist_ok=True)
     result.save(output / "params_x_hat.yaml")
     files.write_xml(loaded, result.scene, scene, output / "identified.xml")
+    print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)
+    log(f"wrote {output}/params_x_hat.yaml, identified.xml")
     text = page.identified_page(Path(scene).name, loaded, result, fitted, judged)
     write(output / "report.html", text)
-    log(f"wrote {output}/params_x_hat.yaml, identified.xml, report.html")
+    log(f"wrote {output}/report.html")
     return 0 if result.is_sound else 1
 
 

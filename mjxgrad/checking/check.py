@@ -185,14 +185,13 @@ def check(
     names, outcomes = _outcomes(scene, outcome, rng)
     if cost is not None and (motions.bad_steps < 0).any():
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
-    first = lambda one: say(f"- First verdict. {findings.slope_finding(slopes(one.lines)).text}")  # noqa: E731
     measured, prices = None, {}
     if derivatives and (motions.bad_steps < 0).any():
         say("measuring derivatives by C MuJoCo")
         mover = Mover(scene, _BATCH, outcomes, started + budget)
         with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(
-                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say, first=first
+                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
             )
         found += findings.measured_findings(measured) if measured and measured.lines else ()
         found += findings.left_out_findings(measured if measured and measured.lines else None, budget)

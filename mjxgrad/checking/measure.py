@@ -164,9 +164,8 @@ def measure(
     from_start: bool,
     seconds: int | float,
     log: Callable[[str], None],
-    first: Callable[["Measured"], None],
 ) -> Measured:
-    """Measure along lines and under noise within a budget in seconds, and leave out the rest; `first` gets the first line."""
+    """Measure along lines and under noise within a budget in seconds, and leave out the rest."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
@@ -201,9 +200,8 @@ def measure(
         mover.end = max(end, time.perf_counter() + 2 * seconds) if is_first else end
         try:
             found.append(task(nearest(slopes(of_kind(Line)))) if "noise" in words else task())
-            if is_first:
-                first(so_far())
-            log(f"{number + 1} of {len(asked)}: {words}")
+            errors = (f"{one.kind} {one.error:.1%} off" for one in slopes(of_kind(Line)) if one.errors.size)
+            log("; ".join([f"{number + 1} of {len(asked)}: {words}", *errors]))
         except TimeoutError:
             left_out.append(words)
         except KeyboardInterrupt:
@@ -295,7 +293,7 @@ class _Probe:
         growth = np.nanmedian(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
         return Line(pose, words, plain, shorter, jumps, changed, growth, own[1].num_diverged + fine.num_diverged)
 
-    def _in_time(self, move: Callable[[np.ndarray], Moved], values: np.ndarray, share: float = _LINE_SHARE) -> Moved:
+    def _in_time(self, move: Callable[..., Moved], values: np.ndarray, share: float = _LINE_SHARE) -> Moved:
         """Move values of a batch in chunks as long as there is time, the first in any case; the others are NaN.
 
         Slopes take most of the time. A few motions tell them nearly as well as all, where they scatter little.
@@ -308,7 +306,7 @@ class _Probe:
             part = move(values[first::_NUM_CHUNKS])
             if whole is None:
                 room = lambda x: np.full((len(values), *np.shape(x)[1:]), np.nan)  # noqa: E731
-                whole = Moved(*map(room, (part.outcomes, part.derivatives, part.growth)), 0)
+                whole = Moved(room(part.outcomes), room(part.derivatives), room(part.growth), 0)
             for name in ("outcomes", "derivatives", "growth"):
                 getattr(whole, name)[first::_NUM_CHUNKS] = getattr(part, name)
             chunk = self.mover.seconds("slope", self.lengths[-1] * len(values)) / _NUM_CHUNKS

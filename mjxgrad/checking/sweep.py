@@ -36,6 +36,7 @@ from mjxgrad.stepping import Contact, Discrete, EngineName, Slope
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
 _SHORT = 0.33  # time step times the frequency of a contact, from which it lasts at most three steps
+_ERRORS = f"Error of a gradient from {BATCH} rollouts, by bias and scatter, over the gradient."
 _UNFELT = 1e-9  # of the cost, gradients that are rounding
 _PAIRS = 256  # pairs of rollouts at once
 _FEW = 8  # numbers of a direction that are printed
@@ -216,10 +217,10 @@ class Sweep(Paged):
     def best(self) -> list[str]:
         """Return the estimate to take at each stiffness: that of least error; α-order where it gains more than a tenth."""
         errors = self.errors()
-        by_gain = {
-            name: np.nan_to_num(x * (1.1 if name == "alpha_order" else 1), nan=np.inf) for name, x in errors.items()
-        }
-        return [min(by_gain, key=lambda name: by_gain[name][row]) for row in range(len(self.labels))]
+        ranks = np.array(
+            [np.nan_to_num(x * (1.1 if name == "alpha_order" else 1), nan=np.inf) for name, x in errors.items()]
+        )
+        return [list(errors)[number] for number in ranks.argmin(axis=0)]
 
     @property
     def headline(self) -> str:
@@ -229,39 +230,39 @@ class Sweep(Paged):
         if len(table["truth"]) > 1 and not any(np.ptp(one, axis=0).any() for one in measured):
             return "Stiffness changes nothing: nothing touches in these motions; start nearer, or look further ahead."
         if np.abs(table["truth"]).max() <= _UNFELT * np.abs(self.result.cost).max():
-            return (
-                "The noise does not reach the cost: nothing moved touches what it sees; start nearer, or look further."
-            )
+            return "The noise does not reach the cost: what moves does not touch what counts; start nearer, or look further."
         row, best, errors = int(np.argmin(abs(self.result.knob[1] - self.own))), self.best(), self.errors()
         taken, off = best[row], errors[best[row]][row]
         ratio = (table[f"{taken}_variance"] / table["zeroth_variance"])[row, 0]
         reach = np.abs([table[f"{taken}_bias{end}"][row, 0] for end in ("_low", "_high")]).max()
         reach /= abs(table["truth"][row, 0])
-        sure = "" if taken == "zeroth" else f"its variance is {ratio:.2g} of zeroth order's, "
-        if taken == "zeroth":
-            other = errors.get("first", [np.inf])[row]
-            sure = f"it has no bias, and first order is {percent(other)} off, "
-        elif table[f"{taken}_is_biased"][row, 0]:
-            sure += f"its bias {percent(abs(table[f'{taken}_bias'] / table['truth'])[row, 0])} of the gradient, "
-        else:
-            sure += f"and no bias was seen above {percent(reach)}, "
-        cost = f"{BATCH * self.result.seconds:.2g} s a gradient of {BATCH} rollouts"
-        answer = f"Take {ESTIMATES[taken]}: {sure}{percent(off)} off in all; {cost}."
-        if reach > 1 and taken != "zeroth":
-            answer = answer.removesuffix(".") + "; more samples make it surer."
+        sure = "it has no bias"
+        if taken != "zeroth":
+            bias = percent(abs(table[f"{taken}_bias"] / table["truth"])[row, 0])
+            seen = (
+                f"its bias is {bias}"
+                if table[f"{taken}_is_biased"][row, 0]
+                else f"no bias was seen above {percent(reach)}"
+            )
+            sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}" + ", more samples would tell" * (
+                reach > 1
+            )
+        others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
+        answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient."
+        answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}."
         for label, other in zip(self.labels[row + 1 :], best[row + 1 :], strict=True):
             if other != taken:
                 return f"{answer} From {label} 1/s² on {ESTIMATES[other]}."
         return answer
 
     def __str__(self) -> str:
-        lines = [f"{self.name}: {self.headline}", self.question, "\n".join(aligned(self._rows(), str.ljust))]
-        return "\n\n".join([*lines, self.result.summary(self.labels)])
+        errors = "\n".join([_ERRORS, *aligned(self._rows(), str.ljust)])
+        return "\n\n".join([f"{self.name}: {self.headline}", errors, self.question, self.result.summary(self.labels)])
 
     def _rows(self) -> list[list[str]]:
         """Return the table of errors as text, header first; the estimate to take is marked."""
         errors, best = self.errors(), self.best()
-        head = ["stiffness, 1/s²", *(f"error: {ESTIMATES[name]}" for name in errors), "take"]
+        head = ["stiffness, 1/s²", *(ESTIMATES[name] for name in errors), "take"]
         cells = [[percent(x) for x in errors[name]] for name in errors]
         return [head, *map(list, zip(self.labels, *cells, [ESTIMATES[name] for name in best], strict=True))]
 
@@ -269,13 +270,13 @@ class Sweep(Paged):
         """Return the sweep as a self-contained page; needs `mjxgrad[render]`."""
         parts = [svg(functools.partial(self.result.plot, one), f"{one} over stiffness") for one in ("bias", "variance")]
         told = f"Bars: {self.result.confidence:.0%} intervals. Bias in cost per unit of what is moved, variance in its square."
-        head, *rows = self._rows()
+        head, *rows = [row[:-1] for row in self._rows()]
         mark = frozenset((i, 1 + list(self.errors()).index(name)) for i, name in enumerate(self.best()))
-        caption = f"Error of a gradient from {BATCH} rollouts, bias and scatter, over the gradient: the least is bold."
-        table = Block(table=Table(head, rows, caption, mark))
+        table = Block(table=Table(head, rows, f"{_ERRORS} The least is bold.", mark))
         details = Block(folded="Bias and variance in numbers", code=self.result.summary(self.labels))
         blocks = [table, Block(drawings=parts, caption=told), Block(text=self.question), details]
-        return page(self.headline, f"mjxgrad sweep {self.name}", blocks)
+        answer, _, more = self.headline.partition(". ")
+        return page(f"{answer}.", f"mjxgrad sweep {self.name}", [Block(text=more), *blocks])
 
 
 @in_double
@@ -333,25 +334,25 @@ def sweep(
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
     given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
-    say, began, last = log or (lambda _: None), time.perf_counter(), [0]
+    say, began, last = log or (lambda _: None), [], [0]
 
     def progress(done: int, total: int) -> None:
-        spent, part = time.perf_counter() - began, -(-8 * done // total)
-        if part > last[0] or done == 1:
+        began.append(time.perf_counter())  # first, when all is compiled
+        if (part := 8 * done // total) > last[0] and done > 1:
             last[0] = part
-            say(f"{done} of {total} parts, {duration(spent * (total - done) / done)} left")
+            left = (began[-1] - began[0]) / (done - 1) * (total - done)
+            say(f"{done} of {total} parts, {duration(left)} left")
 
-    by, what = (
-        engine_of(scene, task.contact).title,
+    what, by = (
         f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each",
+        engine_of(scene, task.contact),
     )
-    if engine_of(scene, task.contact) is ENGINES[QUICK] and task.num_controls:
+    if by is ENGINES[QUICK] and task.num_controls:
         price = seconds_of(scene, task.horizon)
         one = price[getattr(task.contact, "gradient", "slope")]
         seconds = len(swept) * (num_samples * one + num_reference * price["motion"])
-        say(f"{what}: about {duration(seconds)}, {BATCH * one:.2g} s a gradient of {BATCH} rollouts, by {by}")
-    else:
-        say(f"{what}: compiling by {by}")
+        what += f": {duration(seconds)}, {BATCH * one:.2g} s a gradient"
+    say(f"{what}, by {by.title}; compiling first")
     result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=progress, **given)
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
@@ -371,8 +372,8 @@ def sweep(
     if not np.isfinite(result.table()["truth"]).any():
         raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
     if result.share < 1:
-        left = f", without {len(swept) - len(result.cost)} of {len(swept)} stiffnesses" * (
-            len(result.cost) < len(swept)
+        left = len(swept) - len(result.cost)
+        told.append(
+            f"Interrupted after {result.share:.0%} of the rollouts" + f", without {left} stiffnesses" * bool(left) + "."
         )
-        told.append(f"Interrupted after {result.share:.0%} of the rollouts{left}.")
     return Sweep(scene.name, " ".join(told), knob.own, result)

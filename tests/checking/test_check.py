@@ -163,8 +163,8 @@ def measuring():
     scene, rng = mg.load_scene(ball()), np.random.default_rng(0)
     motions, stability = random_motions(scene, rng), mg.check_stability(scene, speed=1.0)
 
-    def measured_by(mover, first=lambda _: None):
-        return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=lambda _: None, first=first)
+    def measured_by(mover, log=lambda _: None):
+        return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=log)
 
     return measured_by, lambda measured: recommend(motions, stability, measured, None)
 
@@ -193,7 +193,9 @@ class OutOfTime(Mover):
 def test_questions_that_there_is_no_time_for_are_left_out_by_name(measuring):
     measured_by, advise = measuring
     measured = measured_by(OutOfTime(), (told := []).append)
-    assert [(len(one.lines), len(one.noises)) for one in told] == [(1, 0)]  # said before all else is measured
+    assert told[1].startswith(
+        "1 of 7: a line along the start; slope 0.0% off; discrete 0.0% off"
+    )  # before all else is measured
     assert (len(measured.lines), len(measured.noises), len(measured.left_out)) == (1, 1, 5)
     (told,) = left_out_findings(measured, 60)
     for words in ("budget of 60 s", "a line along the controls", "noise of 0.3", "contacts at"):

@@ -91,7 +91,7 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
     assert swept.labels == ["1000", "2500 (file)", "1e6"]
     lines = str(swept).splitlines()
     assert lines[0].startswith("block.xml: Take ")
-    assert "s a gradient of 16 rollouts" in lines[0]
+    assert "s a gradient. From 16 rollouts it is " in lines[0]
     assert [line.split("  ")[0] for line in lines if line.startswith(("1000", "2500", "1e6 !"))][-3:] == [
         *swept.labels[:2],
         "1e6 !",
@@ -102,7 +102,8 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
 
 def test_the_page_has_answer_picture_table_and_sentence(swept):
     page = swept.as_html()
-    assert f"<h1>{swept.headline}</h1>" in re.sub("</?span.*?>", "", page)
+    answer = swept.headline.partition(". ")[0]
+    assert f"<h1>{answer}.</h1>" in html.unescape(re.sub("</?span.*?>", "", page))
     assert page.count("<svg role=") == 2  # bias and variance
     assert html.escape(page) in swept._repr_html_()  # a notebook shows it in a frame
     assert page.index("<h1>") < page.index("2500 (file)") < page.index("<svg")
@@ -229,14 +230,13 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
     np.testing.assert_allclose(swept.errors()["first"], [0.1, 0.1, np.sqrt(0.25 + 0.01 - 1e-4)], rtol=1e-6)
     told = re.sub(r"[\d.e-]+ s a gradient", "0.3 s a gradient", swept.headline)
     assert told == (
-        "Take first order: its variance is 0.04 of zeroth order's, and no bias was seen above 2 %, 10 % off in all; "
-        "0.3 s a gradient of 16 rollouts. From 1e6 1/s² on α-order."
+        "Take first order: its variance is 0.04 of zeroth order's and no bias was seen above 2 %; 0.3 s a gradient. "
+        "From 16 rollouts it is 10 % off, zeroth order 50 %, α-order 25 %. From 1e6 1/s² on α-order."
     )
     table["first_bias"][1] = table["first_bias_low"][1] = table["first_bias_high"][1] = 2.0
     table["alpha_order_variance"][:] = 100.0
-    assert swept.headline.startswith(
-        "Take zeroth order: it has no bias, and first order is 200 % off, 50 % off in all; "
-    )
+    assert swept.headline.startswith("Take zeroth order: it has no bias; ")
+    assert " it is 50 % off, first order 200 %, α-order 250 %." in swept.headline
     table |= {name: np.zeros((3, 1)) for name in table if name.endswith("_bias") or name == "truth"}
     assert swept.headline.startswith("Stiffness changes nothing: nothing touches")
 
