@@ -1,5 +1,7 @@
 """Which identifies faster, `mg.identify` or `mujoco.sysid`, and do both give the same answer? `make identify-bench`.
 
+`make identify-bench ARGS="--sets 20"` asks how often intervals hold on two robots with contact, see `robots`.
+
 A chain of hinges is driven by motors. C MuJoCo simulates windows of 100 steps, each from another start, and the joint angles are
 recorded with noise. Unknown are, joint by joint, the armature, the damping and the mass of the link. Both begin at the same wrong
 values and minimise the same residuals in double precision. They take turns, so that load meets both alike.
@@ -21,6 +23,7 @@ import os
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import cyclopts
@@ -204,6 +207,260 @@ def _print(case: tuple[int, int], row: Row) -> None:
     print(f"| {' | '.join(map(str, cells))} |", flush=True)
 
 
+class Robot(NamedTuple):
+    """A robot, the place at which its joints start, its controls, and ten numbers: for `mg.identify`, and in an `MjSpec`."""
+
+    xml: str
+    start: tuple[float, ...]
+    drive: Callable[[np.random.Generator, np.ndarray], np.ndarray]
+    num_steps: int
+    ours: dict[str, tuple[Any, ...]]
+    theirs: dict[str, Callable[[Any, float], None]]
+
+
+def _sled_drive(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+    (fast, slow, swing), phase = 2 * np.pi * rng.uniform(1, 3, 3), rng.uniform(0, 2 * np.pi, 2)
+    push = 0.8 * np.sin(fast * times + phase[0]) + 0.2 * np.sin(2 * slow * times)
+    return np.stack([push, 0.6 * np.sin(swing * times + phase[1])], axis=1)
+
+
+def _leg_drive(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
+    rate, phase, size = 2 * np.pi * rng.uniform(1.5, 3, 2), rng.uniform(0, 2 * np.pi, 2), rng.uniform(0.25, 0.4, 2)
+    return (0.45, -0.9) + size * (1, 1.5) * (np.sin(rate * times[:, None] + phase) - np.sin(phase))
+
+
+def _to(kind: str, name: str, field: str, *columns: tuple[int, float]) -> Callable[[Any, float], None]:
+    """Return a function that writes a number into a specification, at columns with a sign."""
+
+    def write(spec: Any, value: float) -> None:
+        element = getattr(spec, kind)(name)
+        if not columns:
+            setattr(element, field, value)
+        for column, sign in columns:
+            getattr(element, field)[column] = sign * value
+
+    return write
+
+
+def _to_friction(spec: Any, value: float) -> None:
+    for geom in spec.geoms:
+        geom.friction[0] = value
+
+
+def _to_gains(spec: Any, value: float) -> None:
+    _to("actuator", "thigh", "gainprm", (0, 1.0))(spec, value)
+    _to("actuator", "thigh", "biasprm", (1, -1.0))(spec, value)
+
+
+_KP = lambda model, value: {  # noqa: E731
+    "actuator_gainprm": model.actuator_gainprm.at[0, 0].set(value),
+    "actuator_biasprm": model.actuator_biasprm.at[0, 1].set(-value),
+}
+ROBOTS = {
+    "sled": Robot(
+        """<mujoco><option timestep="0.004"/><worldbody><geom name="floor" type="plane" size="5 5 .1" friction=".5"/>
+          <body name="sled" pos="0 0 .05"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
+          <joint name="z" type="slide" axis="0 0 1"/><geom name="sled" type="box" size=".12 .08 .05" mass="2" friction=".5"/>
+          <body name="pole" pos="0 0 .05"><joint name="hinge" axis="0 1 0" damping=".1" armature=".01" frictionloss=".05"
+          stiffness=".5"/><geom name="pole" type="capsule" fromto="0 0 0 0 0 .5" size=".02" mass=".3" contype="0"
+          conaffinity="0"/></body></body></worldbody><actuator><motor name="push" joint="x" gear="30"/>
+          <motor name="swing" joint="hinge" gear="2"/></actuator></mujoco>""",
+        (0.0, 0.0, 0.0),
+        _sled_drive,
+        300,
+        {
+            "friction": ("friction",),
+            "mass": ("mass", "sled"),
+            "damping": ("damping", "hinge"),
+            "armature": ("armature", "hinge"),
+            "gear": ("gear", "push"),
+            "gear of swing": ("gear", "swing"),
+            "friction loss": ("friction_loss", "hinge"),
+            "damping of x": ("damping", "x"),
+            "spring": ("number", "jnt_stiffness", "hinge"),
+            "place of the centre": ("number", "body_ipos", "pole", 0, (-0.05, 0.05)),
+        },
+        {
+            "friction": _to_friction,
+            "mass": _to("geom", "sled", "mass"),
+            "damping": _to("joint", "hinge", "damping", (0, 1.0)),
+            "armature": _to("joint", "hinge", "armature"),
+            "gear": _to("actuator", "push", "gear", (0, 1.0)),
+            "gear of swing": _to("actuator", "swing", "gear", (0, 1.0)),
+            "friction loss": _to("joint", "hinge", "frictionloss"),
+            "damping of x": _to("joint", "x", "damping", (0, 1.0)),
+            "spring": _to("joint", "hinge", "stiffness", (0, 1.0)),
+            "place of the centre": _to("geom", "pole", "fromto", (0, 1.0), (3, 1.0)),
+        },
+    ),
+    "leg": Robot(
+        """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="5 5 .1" friction=".8"/>
+          <body name="hip" pos="0 0 .36"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
+          <joint name="z" type="slide" axis="0 0 1"/><geom name="hip" type="box" size=".08 .05 .05" mass="3" contype="0"
+          conaffinity="0"/><body name="thigh"><joint name="thigh" axis="0 1 0" damping=".2" armature=".01"
+          frictionloss=".1"/><geom name="thigh" type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".8" contype="0"
+          conaffinity="0"/><body name="shank" pos="0 0 -.2"><joint name="knee" axis="0 1 0" damping=".2" armature=".01"
+          frictionloss=".1"/><geom name="shank" type="capsule" fromto="0 0 0 0 0 -.2" size=".015" mass=".4" contype="0"
+          conaffinity="0"/><geom name="foot" pos="0 0 -.2" size=".025" mass=".05" friction=".8"/></body></body></body>
+          </worldbody><actuator><position name="thigh" joint="thigh" kp="60" kv="1"/>
+          <position name="knee" joint="knee" kp="60" kv="1"/></actuator></mujoco>""",
+        (0.0, 0.0, 0.45, -0.9),
+        _leg_drive,
+        400,
+        {
+            "friction": ("friction",),
+            "mass of the hip": ("mass", "hip"),
+            "mass of the thigh": ("mass", "thigh"),
+            "armature of the thigh": ("armature", "thigh"),
+            "damping": ("damping", "knee"),
+            "armature": ("armature", "knee"),
+            "gain": (_KP, 60.0),
+            "friction loss": ("friction_loss", "knee"),
+            "friction loss of the thigh": ("friction_loss", "thigh"),
+            "length": ("number", "body_pos", "shank", 2, (-0.3, -0.1)),
+        },
+        {
+            "friction": _to_friction,
+            "mass of the hip": _to("geom", "hip", "mass"),
+            "mass of the thigh": _to("geom", "thigh", "mass"),
+            "armature of the thigh": _to("joint", "thigh", "armature"),
+            "damping": _to("joint", "knee", "damping", (0, 1.0)),
+            "armature": _to("joint", "knee", "armature"),
+            "gain": _to_gains,
+            "friction loss": _to("joint", "knee", "frictionloss"),
+            "friction loss of the thigh": _to("joint", "thigh", "frictionloss"),
+            "length": _to("body", "shank", "pos", (2, 1.0)),
+        },
+    ),
+}
+
+
+class Set(NamedTuple):
+    """A scene with nominal numbers, ten parameters, their true values, and five recordings."""
+
+    scene: mg.Scene
+    parameters: dict[str, identification.Parameter]
+    truth: dict[str, float]
+    recordings: list[identification.Recording]
+
+
+def recorded(robot: Robot, seed: int, count: int = 5) -> Set:
+    """Return recordings of a robot whose numbers are 30 % off, give or take: joints to 1 mm and 1 mrad, the first row, too."""
+    scene, rng = mg.load_scene(robot.xml, keep_everything=True), np.random.default_rng(seed)
+    parameters, truth = {}, {}
+    for name, (kind, *arguments) in robot.ours.items():
+        if callable(kind):
+            (nominal,) = arguments
+            made = identification.Parameter(nominal, nominal / 10, 10 * nominal, kind)
+        else:
+            names = [one for one in arguments if isinstance(one, str)]
+            given = dict(zip(("column", "bounds"), arguments[len(names) :], strict=False))
+            made = getattr(identification, kind)(scene, *names, **given)
+        parameters[name] = made
+        off = rng.uniform(-0.3, 0.3)
+        truth[name] = float(made.nominal) * np.exp(off) if made.nominal else off * float(made.upper)
+    spec = mujoco.MjSpec.from_string(robot.xml)
+    for name, value in truth.items():
+        robot.theirs[name](spec, value)
+    model, recordings = spec.compile(), []
+    for _ in range(count):
+        data, controls = mujoco.MjData(model), robot.drive(rng, model.opt.timestep * np.arange(robot.num_steps))
+        data.qpos[:] = robot.start
+        places = [data.qpos.copy()]
+        for ctrl in controls:
+            data.ctrl[:] = ctrl
+            mujoco.mj_step(model, data)
+            places.append(data.qpos.copy())
+        measured = np.array(places) + _NOISE * rng.normal(size=(len(places), model.nq))
+        recordings.append(identification.Recording({"qpos": measured}, controls, noise={"qpos": _NOISE}))
+    return Set(scene, parameters, truth, recordings)
+
+
+class Verdict(NamedTuple):
+    """Errors in half widths of the 95 % intervals, half widths over the values, residuals over the noise, and seconds."""
+
+    errors: np.ndarray
+    widths: np.ndarray
+    rms: float
+    seconds: float
+
+
+def judge(given: Set) -> Verdict:
+    """Return the verdict on `mg.identify`."""
+    begin = time.perf_counter()
+    found = mg.identify(given.scene, given.parameters, given.recordings)
+    seconds = time.perf_counter() - begin
+    truth = np.array(list(given.truth.values()))
+    values, halves = (
+        np.array([float(part[name]) for name in given.truth]) for part in (found.values, found.half_width)
+    )
+    return Verdict((values - truth) / halves, halves / np.abs(truth), found.rms[1], seconds)
+
+
+def judge_theirs(robot: Robot, given: Set) -> Verdict:
+    """Return the verdict on `mujoco.sysid`, whose starts are the first rows, at rest."""
+    spec = mujoco.MjSpec.from_string(robot.xml)
+    model = spec.compile()
+    names = [(f"{model.joint(i).name}_qpos", sysid.SignalType.MjStateQPos) for i in range(model.nv)]
+    times = model.opt.timestep * np.arange(robot.num_steps + 1)
+    starts = [np.concatenate([[0.0], one.measured["qpos"][0], np.zeros(model.nv)]) for one in given.recordings]
+    controls = [sysid.TimeSeries(times, np.vstack([one.controls, one.controls[-1:]])) for one in given.recordings]
+    measured = [
+        sysid.TimeSeries.from_names(times[1:], one.measured["qpos"][1:], model, names) for one in given.recordings
+    ]
+    windows = [f"recording{i}" for i in range(len(starts))]
+    sequences = sysid.ModelSequences("robot", spec, windows, starts, controls, measured, True)
+    unknown = sysid.ParameterDict()
+    for name, part in given.parameters.items():
+
+        def write(spec: Any, parameter: Any, name: str = name) -> None:
+            robot.theirs[name](spec, parameter.value[0])
+
+        bounds = float(part.lower), float(part.upper)
+        unknown.add(sysid.Parameter(name, float(part.nominal), *bounds, modifier=write))
+    residual = sysid.build_residual_fn(models_sequences=[sequences])
+    begin = time.perf_counter()
+    with contextlib.redirect_stdout(io.StringIO()):
+        _, found = sysid.optimize(unknown, residual, verbose=False, **_THEIRS)
+    left, _, _ = residual(found.x, unknown, return_pred_all=True)
+    _, half = sysid.calculate_intervals(left, found.jac)
+    seconds, truth = time.perf_counter() - begin, np.array(list(given.truth.values()))
+    return Verdict((found.x - truth) / half, half / np.abs(truth), float("nan"), seconds)
+
+
+def robots(sets: int, limit: float) -> None:
+    """Measure how often intervals of ten numbers hold: so many sets of five recordings of each robot.
+
+    Args:
+        sets: sets of recordings of a robot.
+        limit: of theirs on a robot, after which no other run begins (s).
+    """
+    for name, robot in ROBOTS.items():
+        ours, theirs, spent = [], [], 0.0
+        for seed in range(sets):
+            given = recorded(robot, seed)
+            ours.append(judge(given))
+            if spent < limit:
+                theirs.append(judge_theirs(robot, given))
+                spent += theirs[-1].seconds
+            print(
+                f"  {name} {seed}: {ours[-1].seconds:.1f} s, {np.sum(abs(ours[-1].errors) <= 1)} of 10 hold", flush=True
+            )
+        for who, found in (("mg.identify", ours), ("mujoco.sysid", theirs)):
+            errors, widths = np.array([one.errors for one in found]), np.median([one.widths for one in found], axis=0)
+            held, seconds = np.abs(errors) <= 1, [one.seconds for one in found]
+            print(
+                f"| {name} | {who} | {len(found)} | {100 * held.mean():.0f} % | "
+                f"{statistics.median(seconds):.1f} ({min(seconds):.1f} to {max(seconds):.1f}) | "
+                + ", ".join(
+                    f"{key} {n} ({100 * w:.2g} %)"
+                    for key, n, w in zip(robot.ours, held.sum(axis=0), widths, strict=True)
+                )
+                + " |",
+                flush=True,
+            )
+
+
 _Many = cyclopts.Parameter(consume_multiple=True, negative="")
 
 
@@ -213,6 +470,7 @@ def identify(
     windows: Annotated[tuple[int, ...], _Many] = (1, 10, 100),
     runs: int = 5,
     limit: float = 120,
+    sets: int = 0,
 ) -> None:
     """Measure identification against mujoco.sysid.
 
@@ -221,12 +479,18 @@ def identify(
         windows: how many are recorded, case by case.
         runs: runs of a problem.
         limit: of a problem, after which no other run begins (s).
+        sets: where above 0, sets of five recordings of each of two robots, in place of the chains.
     """
     logging.getLogger("absl").setLevel(logging.ERROR)  # theirs warns of each window that angles are no sensors
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     announce(f"load {os.getloadavg()[0]:.1f} before")
+    if sets:
+        print(
+            "| robot | by | sets | intervals that hold | seconds | of these (median half width) |\n" + "|---" * 6 + "|"
+        )
+        return robots(sets, limit)
     print(
         f"theirs: {_THEIRS}\nours: {_OURS}, ends when 1e-3 of a standard error is left to go\n"
         f"seconds are the median of the runs (and the least), differences the largest\n\n{_HEAD}"

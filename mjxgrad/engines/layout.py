@@ -68,15 +68,19 @@ class Layout:
     def difference(self, ends: Float[np.ndarray, "... size"], starts: Float[np.ndarray, "... size"]) -> np.ndarray:
         """Return the changes that move starts to ends."""
         change = np.empty((*np.broadcast_shapes(ends.shape[:-1], starts.shape[:-1]), self.num_changes))
-        first = self.places["qpos"].start
-        plain = first + self.plain_qpos
-        change[..., self.plain_dofs] = ends[..., plain] - starts[..., plain]
-        if self.turns.size:
-            at = first + self.quaternions
-            inverse = starts[..., at] * np.array([1.0, -1.0, -1.0, -1.0])
-            change[..., self.turns] = _logarithm(_times(inverse, ends[..., at]))
+        at = self.places["qpos"]
+        change[..., : self.nv] = self.displacement(ends[..., at], starts[..., at])
         change[..., self.nv : 2 * self.nv] = ends[..., self.places["qvel"]] - starts[..., self.places["qvel"]]
         change[..., 2 * self.nv :] = ends[..., self.rest] - starts[..., self.rest]
+        return change
+
+    def displacement(self, ends: Float[np.ndarray, "... nq"], starts: Float[np.ndarray, "... nq"]) -> np.ndarray:
+        """Return the changes that move positions to others; a quaternion needs no length of 1."""
+        change = np.empty((*np.broadcast_shapes(ends.shape[:-1], starts.shape[:-1]), self.nv))
+        change[..., self.plain_dofs] = ends[..., self.plain_qpos] - starts[..., self.plain_qpos]
+        if self.turns.size:
+            inverse = starts[..., self.quaternions] * np.array([1.0, -1.0, -1.0, -1.0])
+            change[..., self.turns] = _logarithm(_times(inverse, ends[..., self.quaternions]))
         return change
 
     def carry(self, turned: Float[np.ndarray, "... nv"], values: Float[np.ndarray, "... nv columns"]) -> np.ndarray:

@@ -10,13 +10,14 @@ from mjxgrad.identification.parameters import (
     gear,
     inertia,
     mass,
+    number,
     softness,
 )
 from mjxgrad.identification.recording import Recording
-from mjxgrad.identification.result import Identification, Stopped
-from mjxgrad.identification.search import identify
+from mjxgrad.identification.result import Identification, Outlook, Stopped
+from mjxgrad.identification.search import identify, outlook
 
 __all__ = [
-    "Identification", "Parameter", "Recording", "Stopped", "armature", "damping", "friction", "friction_loss", "gains", "gear",
-    "identify", "inertia", "mass", "softness",
+    "Identification", "Outlook", "Parameter", "Recording", "Stopped", "armature", "damping", "friction", "friction_loss",
+    "gains", "gear", "identify", "inertia", "mass", "number", "outlook", "softness",
 ]  # fmt: skip

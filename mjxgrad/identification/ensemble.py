@@ -1,16 +1,15 @@
 r"""Values by the mean of many motions, for scenes whose contacts chatter, so that no single motion tells.
 
 Each switch of a chattering contact makes the later motion jump, and the sum of squares of one motion has a minimum in every
-cell between two jumps. The mean of motions whose values and starts differ a little is smooth. Let $r_i$ be the residuals, in
-units of the noise, of motions with values $\theta_i$ about $\bar\theta$ and with starts as noisy as they were measured. The
-linear regression $r_i = \mu + J (\theta_i - \bar\theta) + e_i$ separates the effect of the values from that of chatter. The
-recording is one more such motion. Generalised least squares with the covariance $\sigma^2 + \mathrm{cov}(e)$ thus give the next
-$\bar\theta$ and its covariance, chatter included, from which the next motions are drawn. The first motions are drawn between
-the bounds, and then about those that fit best (the cross-entropy method).
+cell between two jumps. The mean of motions whose values and starts differ a little is smooth. Let $r_i$ be the residuals of a
+window, in units of the noise, of motions with values $\theta_i$ about $\bar\theta$ and starts $s_i$ about $\bar s$. The linear
+regression $r_i = \mu + J (\theta_i - \bar\theta) + K (s_i - \bar s) + e_i$ separates the effects of values and start from
+chatter. The recording is one more such motion. Generalised least squares with the covariance $\sigma^2 + \mathrm{cov}(e)$ give
+the next $\bar\theta$ and $\bar s$ and their covariance, from which the next motions are drawn, until both stay. The first
+motions spread wider than any answer, so that the covariance shrinks to what chatter allows and not to a cell.
 
 References:
     Evensen. Analysis of iterative ensemble smoothers for solving inverse problems. Computational Geosciences 22 (2018).
-    Rubinstein, Kroese. The Cross-Entropy Method. Springer 2004.
     Hartlap, Simon, Schneider. Why your model parameter confidences might be too optimistic. A&A 464 (2007).
 """
 
@@ -20,190 +19,145 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mjxgrad.identification.normal import solved, split, squares
 from mjxgrad.rollouts import DivergedError
 
-# Motions of an ensemble at first and at most, at least for each parameter, and numbers at most, for memory.
-_NUM_MOTIONS, _PER_NUMBER, _MOST_NUMBERS = (512, 2048), 20, 1e8
-_NUM_ALONE, _MOST_ALONE = 4096, 32  # motions, of which some alone nearly fit, and those kept
-_MOST_ENSEMBLES, _PATIENCE = 20, 8  # ensembles at most, and since the misfit last fell
 # Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
 MISFIT = 1.5
-# Share of the motions that fit best; factor of their median loss by which it goes on.
-_ELITE, _STILL_FALLS = 0.0625, 0.98
-# Scale of the first loss, which grows with logarithms beyond it: after some jumps two motions have nothing in common, and their
-# squares would drown what still tells. It is a share of the noise, or of the nominal motion's residuals.
-_SCALE, _SCALE_OF_FIRST = 0.3, 0.03
-# Widths of an ensemble over the standard error: wider ones add what is not linear, and the last one shows the derivative.
-_WIDER, _LAST = 1.0, 2.0
+_MOTIONS, _PER_NUMBER = 192, 8  # motions of an ensemble at least, and for each unknown of a window
+_MOST = 16  # ensembles
+_MORE = 4  # times as many motions at most
+_NARROWER, _WIDER = 0.25, 2.0  # widths that are kept from before; where the mean has missed
+_CHATTER, _EXCESS = (
+    (1.5, 3.0, 6.0, 12.0),
+    1.0,
+)  # of its variance; standard errors of a sum of squares beyond which it is more
 _LONGEST = 3.0  # widths that a step goes at most
-# At the end: step in widths; misfit of the covariance, by fewer motions than at most and by most; ratio of successive widths.
-_SHORT, _FITS, _SETTLED = 1.0, (1.3, MISFIT**2), 1.5
-_CLEAR = 1e-10  # of the largest variance
-_SIZES = np.geomspace(1e-6, 1.0, 81)  # of the noise, where it is not known, over the residuals of the nominal motion
+_SHORT, _SETTLED = 0.7, 1.5  # at the end: step of each number in widths; ratio of successive widths
+_FEWEST, _AVERAGED = (
+    3,
+    3,
+)  # ensembles at least, and those at the end of which the mean is the answer: each has its scatter
 
-_Box = tuple[np.ndarray, np.ndarray]
-_Log = Callable[[float], None]
-Motions = Callable[[Float[np.ndarray, "motions dim"], Float[np.ndarray, "motions windows start"]], np.ndarray]
-"""Function from points and changes of the starts, in units of their noise, to residuals by motion, window and number."""
+Box = tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]
+Motions = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Function from values and starts, by motion, to residuals by motion, window and number."""
 
 
 class Ensemble(NamedTuple):
-    """The last motions, and the point whose mean motion fits the recordings."""
+    """Values and starts whose mean motion fits the recordings, and the motions that told."""
 
-    point: Float[np.ndarray, " dim"]
-    points: Float[np.ndarray, "motions dim"]
-    alone: list[tuple[np.ndarray, np.ndarray]]  # points and changes of the starts of single motions, best first
-    noise: float  # its size, 1 where it is known
+    values: Float[np.ndarray, " dim"]
+    starts: Float[np.ndarray, "windows free"]
+    factors: Float[np.ndarray, "windows columns columns"]  # at this point, weighed by noise and chatter
+    squares: float
+    drawn: Float[np.ndarray, "motions dim"]
     is_settled: bool
-    residual: Float[np.ndarray, " numbers"]  # at the point, over the root of the covariance, times the noise
-    slope: Float[np.ndarray, "numbers dim"]  # likewise, by the point
-
-    def judged(self, residuals: Float[np.ndarray, "motions windows rows"]) -> Float[np.ndarray, " numbers"]:
-        """Return the residual at the point in the same way, from those of the motions for these or other recordings."""
-        is_finite = np.isfinite(residuals).all(axis=(1, 2))
-        if is_finite.sum() < 2 * self.points.shape[1] + 2:
-            return np.full(residuals[0].size, np.inf)
-        model = _Regression(self.points[is_finite], residuals[is_finite])
-        return model.over_root(self.noise) @ np.append(1.0, self.point - model.middle) * self.noise
 
 
-def fit(motions: Motions, box: _Box, starts: tuple[int, int], count: int, noise: float | None, log: _Log) -> Ensemble:
+def size(columns: int) -> int:
+    """Return the number of motions of an ensemble with so many unknowns of a window."""
+    return max(_MOTIONS, _PER_NUMBER * columns)
+
+
+def fit(
+    motions: Motions, point: tuple[np.ndarray, np.ndarray], widths: tuple[np.ndarray, np.ndarray], box: Box,
+    noise: float, count: int, say: Callable[[Ensemble], None],
+) -> Ensemble:  # fmt: skip
     """Return the ensemble whose mean motion fits best.
 
     Args:
         motions: the simulation; motions that diverge have residuals that are not finite.
-        box: least and greatest coordinates of a point; zero is the nominal one.
-        starts: numbers of windows, and of coordinates of a start.
+        point: values and starts at first.
+        widths: standard deviations at first, of the values and of each start.
+        box: least and greatest values.
+        noise: size of the noise in units of the residuals.
         count: number of measured numbers.
-        noise: size of the noise in units of the residuals, None for unknown.
-        log: called with the root mean square misfit of each ensemble.
+        say: called with each ensemble.
     """
-    draw = _Draw(motions, box, starts, count, noise or 0.0)
-    first, middle, covariance = _narrowed(draw, count, noise, log)
-    prior = np.diag(12.0 / (box[1] - box[0]) ** 2)  # the variance of a point between the bounds
-    is_last, misfits = False, []
-    while True:
-        points, _, residuals = draw(middle, covariance)
-        model = _Regression(points, residuals)
-        sizes = [noise] if noise else first * _SIZES
-        draw.noise = size = min(sizes, key=lambda one: model.deviance(one, count, prior))
-        step, inverse, misfit = model.solved(size, prior)
-        log(size * np.sqrt(misfit / count))
-        misfits.append(misfit)
-        length = np.sqrt(step @ np.linalg.pinv(covariance, hermitian=True) @ step)
-        step *= _LONGEST / max(length, _LONGEST)
-        middle, fits = np.clip(model.middle + step, *box), misfit < _FITS[draw.size == draw.most] * count
-        if (is_last and fits) or min(misfits) < min(misfits[-_PATIENCE:]) or len(misfits) == _MOST_ENSEMBLES:
-            break
-        before, covariance = covariance, _WIDER**2 * max(misfit / count, 1.0) * inverse + np.outer(step, step)
-        if not fits:  # the covariance of few motions lacks directions
-            draw.size = min(2 * draw.size, draw.most)
-        is_last = length < _SHORT and fits and (np.diag(before) < _SETTLED**2 * np.diag(covariance)).all()
-        covariance *= _LAST**2 if is_last else 1.0
-    both, alone = model.over_root(size) * size, draw.alone(middle, covariance)
-    residual = both @ np.append(1.0, middle - model.middle)
-    return Ensemble(middle, points, alone, size, bool(is_last and fits), residual, both[:, 1:] * model.sureness(size))
-
-
-class _Draw:
-    """Motions of points about a middle, or between the bounds, with starts off by their noise."""
-
-    def __init__(self, motions: Motions, box: _Box, starts: tuple[int, int], count: int, noise: float):
-        self._motions, self._box, self._starts, self.noise = motions, box, starts, noise
-        fewest = _PER_NUMBER * len(box[0])
-        self.size, self.most = (max(fewest, min(number, int(_MOST_NUMBERS / count))) for number in _NUM_MOTIONS)
-        self._rng = np.random.default_rng(0)
-
-    def __call__(
-        self, middle: np.ndarray | None = None, covariance: np.ndarray | None = None
-    ) -> tuple[np.ndarray, ...]:
-        """Return points, changes of the starts, and residuals of the motions that stay finite."""
-        if middle is None or covariance is None:
-            points = self._rng.uniform(*self._box, (self.size, len(self._box[0])))
-            points[0] = 0.0  # the nominal values, at which no motion diverges
-        else:
-            points = np.clip(self._rng.multivariate_normal(middle, covariance, self.size, method="eigh"), *self._box)
-        starts = self.noise * self._rng.normal(size=(len(points), *self._starts))
-        residuals = self._motions(points, starts)
+    (values, starts), rng, dim = point, np.random.default_rng(0), len(point[0])
+    num = fewest = size(dim + starts.shape[1])
+    root = np.diag(widths[0])
+    ends: list[tuple[np.ndarray, np.ndarray]] = []
+    lowest = np.inf
+    own, along = widths[1][:, :, None] * np.eye(starts.shape[1]), np.zeros((*starts.shape, dim))
+    for index in range(1, _MOST + 1):
+        drawn = np.clip(values + rng.normal(size=(num, dim)) @ root.T, *box)
+        free = np.einsum("wij,mwj->mwi", own, rng.normal(size=(num, *starts.shape)))
+        free += starts + np.einsum("wij,mj->mwi", along, drawn - values)
+        residuals = motions(drawn, free)
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
-        if is_finite.sum() < 2 * points.shape[1] + 2:
-            raise DivergedError("most motions must stay finite between the bounds, got few: give narrower ones")
-        return points[is_finite], starts[is_finite], residuals[is_finite]
+        drawn, free, residuals = drawn[is_finite], free[is_finite], residuals[is_finite]
+        if len(drawn) < 2 * (dim + starts.shape[1]) + 2:
+            raise DivergedError("most motions must stay finite about the best values, got few: give narrower bounds")
+        middle, centres = drawn.mean(axis=0), free.mean(axis=0)
+        model, most = Regression(drawn, free, residuals), count * noise**2 * (1.0 + _EXCESS * np.sqrt(2.0 / count))
+        for (
+            chatter
+        ) in _CHATTER:  # its tails are longer than the normal's; the misfit tells where the recording has more
+            factors, sureness = model.weighed(noise, chatter)
+            step = solved(factors, dim, (box[0] - middle, box[1] - middle))
+            if squares(factors, step.values, step.starts) < most:
+                break
+        length = float(np.linalg.norm(np.linalg.lstsq(root, step.values, rcond=None)[0]))
+        change = step.values * min(1.0, _LONGEST / max(length, 1e-300))
+        by_start, mixed, slope, _ = split(factors, dim)
+        inner = np.linalg.pinv(by_start)
+        moved = -np.einsum("wij,wj->wi", inner, mixed @ np.append(change, 1.0))
+        misfit = squares(factors, change, moved)
+        at_end = factors * sureness
+        at_end[..., -1] = 0.0  # nothing is left to go
+        growth = np.sqrt(max(misfit / (count * noise**2), 1.0)) * noise
+        # A mean that explains less than that of a wider ensemble has missed: between two teeth all looks smooth.
+        has_missed, lowest = misfit > max(most, lowest * most / (count * noise**2)), min(lowest, misfit)
+        num = min(2 * num, _MORE * fewest) if has_missed else num  # few motions lack directions of chatter
+        before, root = root, growth * np.linalg.pinv(slope, rcond=1e-9)
+        wider = (_WIDER if has_missed else _NARROWER) * before
+        root = np.linalg.cholesky(root @ root.T + wider @ wider.T + np.outer(change, change) + 1e-14 * np.eye(dim))
+        own, along = growth * inner, -np.einsum("wij,wjk->wik", inner, mixed[..., :-1])
+        values, starts = middle + change, centres + moved
+        shrunk = np.sqrt(np.diag(before @ before.T) / np.diag(root @ root.T))
+        is_short = (
+            not has_missed and length < _SHORT * np.sqrt(dim) and bool((shrunk < _SETTLED).all()) and index >= _FEWEST
+        )
+        ends = [*ends, (values, starts)] if is_short or ends else []
+        mean = [np.mean(part, axis=0) for part in zip(*(ends or [(values, starts)]), strict=True)]
+        found = Ensemble(*mean, at_end, misfit, drawn, len(ends) == _AVERAGED)
+        say(found)
+        if found.is_settled:
+            break
+    return found
 
-    def alone(self, middle: np.ndarray, covariance: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return points and changes of the starts of the single motions that fit best, each window's start by itself."""
-        found = []
-        for _ in range(max(_NUM_ALONE // self.size, 1)):
-            points, starts, residuals = self(middle, covariance)
-            found.append((points, starts, (residuals**2).sum(axis=2)))
-        points, starts, squares = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        order = np.argsort(squares, axis=0)[:_MOST_ALONE]
-        return [(points[best].mean(axis=0), starts[best, np.arange(len(best))]) for best in order]
 
+class Regression:
+    """The mean residual of each window and its derivatives, and the chatter that is left."""
 
-def _narrowed(draw: _Draw, count: int, noise: float | None, log: _Log) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the nominal root mean square, and mean and covariance of points that fit best, by the cross-entropy method."""
-    points, _, residuals = draw()
-    first, medians = float(np.sqrt((residuals[0] ** 2).sum() / count)), [np.inf]
-    scale = _SCALE * noise if noise else _SCALE_OF_FIRST * first
-    while True:
-        losses = np.log1p((residuals / scale) ** 2).sum(axis=(1, 2))
-        best = np.argsort(losses)[: max(int(_ELITE * len(points)), 2 * points.shape[1])]
-        middle, covariance = points[best].mean(axis=0), 2.0 * np.atleast_2d(np.cov(points[best].T))
-        medians.append(float(np.median(losses[best])))
-        log(float(np.sqrt((residuals[best] ** 2).sum(axis=(1, 2)).min() / count)))
-        if medians[-1] > _STILL_FALLS * medians[-2] or len(medians) > _MOST_ENSEMBLES:
-            return first, middle, covariance
-        points, _, residuals = draw(middle, covariance)
+    def __init__(
+        self, drawn: Float[np.ndarray, "motions dim"], free: Float[np.ndarray, "motions windows free"],
+        residuals: Float[np.ndarray, "motions windows numbers"],
+    ):  # fmt: skip
+        self._parts, self._count, self._width = [], len(drawn), 1 + drawn.shape[1] + free.shape[2]
+        for starts, one in zip(free.swapaxes(0, 1), residuals.swapaxes(0, 1), strict=True):
+            away = np.column_stack([starts - starts.mean(axis=0), drawn - drawn.mean(axis=0), np.ones(self._count)])
+            columns = np.linalg.pinv(away) @ one
+            left = one - away @ columns
+            self._parts.append((columns @ columns.T, left @ columns.T, left @ left.T))
 
+    def weighed(self, noise: float, chatter: float = 1.0) -> tuple[Float[np.ndarray, "windows columns columns"], float]:
+        """Return factors of mean residual and derivatives over the root of the covariance, times the noise.
 
-class _Regression:
-    """Residuals of many motions by their points: the mean and its derivative, and the covariance of what is left."""
-
-    def __init__(self, points: np.ndarray, residuals: np.ndarray):
-        self.middle, self._count = points.mean(axis=0), len(points)
-        away = np.column_stack([np.ones(len(points)), points - self.middle])
-        self._columns = np.einsum("dm,mwn->wnd", np.linalg.pinv(away), residuals)
-        left = residuals - np.einsum("md,wnd->mwn", away, self._columns)
-        # The covariance of each window in terms of its eigenvectors, fewer than motions.
-        self._axes, self._variances = [], []
-        for one in left.swapaxes(0, 1):
-            is_wide = one.shape[0] < one.shape[1]
-            sizes, axes = np.linalg.eigh(one @ one.T if is_wide else one.T @ one)
-            is_clear = sizes > _CLEAR * max(sizes.max(), np.finfo(float).tiny)
-            sizes, axes = sizes[is_clear], axes[:, is_clear]
-            self._axes.append(one.T @ (axes / np.sqrt(sizes)) if is_wide else axes)
-            self._variances.append(sizes / (len(points) - away.shape[1]))
-        self._along = [axes.T @ columns for axes, columns in zip(self._axes, self._columns, strict=True)]
-        across = self._columns - np.stack([a @ b for a, b in zip(self._axes, self._along, strict=True)])
-        self._across = np.einsum("wni,wnj->ij", across, across)
-
-    def _gram(self, size: float) -> np.ndarray:
-        """Return the products of residual and derivative over the covariance with a noise of this size."""
-        parts = zip(self._along, self._variances, strict=True)
-        return self._across / size**2 + sum(along.T @ (along / (size**2 + v)[:, None]) for along, v in parts)
-
-    def solved(self, size: float, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the step to the best point, its covariance, and the misfit that remains: a sum of squares."""
-        gram = self._gram(size)
-        inverse = np.linalg.inv(gram[1:, 1:] + prior)
-        step = -inverse @ gram[1:, 0]
-        end = np.append(1.0, step)
-        return step, inverse, float(end @ gram @ end)
-
-    def deviance(self, size: float, count: int, prior: np.ndarray) -> float:
-        """Return twice the negative logarithm of the likelihood of a noise of this size, up to a constant."""
-        determinant = sum(np.log1p(variances / size**2).sum() for variances in self._variances)
-        return 2 * count * np.log(size) + determinant + self.solved(size, prior)[2]
-
-    def sureness(self, size: float) -> float:
-        """Return the factor of derivatives for a covariance of few motions, whose inverse is too large (Hartlap et al.)."""
-        directions = np.mean([(variances / (size**2 + variances)).sum() for variances in self._variances])
-        return float(np.sqrt(max(1.0 - directions / self._count, 0.1)))
-
-    def over_root(self, size: float) -> Float[np.ndarray, "numbers dim"]:
-        """Return the residual at the middle and its derivative, over the root of the covariance."""
-        parts = []
-        for columns, axes, along, v in zip(self._columns, self._axes, self._along, self._variances, strict=True):
-            parts.append((columns - axes @ ((1 - size / np.sqrt(size**2 + v))[:, None] * along)) / size)
-        return np.concatenate(parts)
+        The covariance is that of noise and chatter, the latter by a factor. Its inverse by few motions is too large (Hartlap et
+        al.): the second result is the factor of derivatives for that.
+        """
+        found, told = [], []
+        scale = max(self._count - self._width, 1) * noise**2 / chatter
+        for plain, along, left in self._parts:
+            # (σ² + e e'/n)⁻¹ = (1 - e (n σ² + e'e)⁻¹ e') / σ², in the space of motions, which are fewer than numbers.
+            inverse = np.linalg.inv(max(scale, 1e-12 * np.trace(left)) * np.eye(self._count) + left)
+            gram = plain - along.T @ inverse @ along
+            told.append(self._count - scale * np.trace(inverse))
+            sizes = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
+            values, axes = np.linalg.eigh(gram / np.outer(sizes, sizes))
+            root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T * sizes
+            found.append(np.linalg.qr(root, mode="r"))
+        return np.stack(found), float(np.sqrt(max(1.0 - np.mean(told) / self._count, 0.1)))

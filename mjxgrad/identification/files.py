@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjxgrad._arrays import real
 from mjxgrad._text import write
 from mjxgrad.identification import parameters
 from mjxgrad.identification.parameters import Parameter
@@ -25,11 +26,6 @@ _SOFTNESS = ("stiffness", "damping_ratio", "width")
 _NAMED = ("mass", "damping", "armature", "friction_loss", "gear")
 KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "gains", "delay")
 """Kinds of parameters that `parameter` knows."""
-_WRITTEN = (
-    *(f"{kind}_{field}" for kind in ("geom", "pair") for field in ("friction", "solref", "solimp")),
-    *("actuator_gear", "actuator_gainprm", "actuator_biasprm", "dof_damping", "dof_armature", "dof_frictionloss"),
-    *("body_mass", "body_ipos", "body_inertia", "body_iquat"),
-)
 _Sizes = Mapping[str, float]  # of noise
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
@@ -37,14 +33,17 @@ _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale o
 def parameter(scene: Scene, text: str) -> Parameter:
     """Return a parameter from text such as `mass:torso`, `friction`, `damping:hip,knee=0.1..5` or `delay=0..0.05`.
 
-    The text is one of `KINDS`, then names that share one value, then bounds. Friction and softness take geoms, or a pair as
-    `floor/foot`, or nothing for all contacts. The scene has the nominal values.
+    The text is one of `KINDS` or a field of the model, then names that share one value, then bounds. Friction and softness take
+    geoms, or a pair as `floor/foot`, or nothing for all contacts; a field with several numbers a column, `body_pos[2]:shin`.
+    The scene has the nominal values.
 
     Raises:
         ValueError: if the text has another form, or a name is unknown.
     """
-    match = re.fullmatch(r"(\w+)(?::([^=]+))?(?:=([^=]+?)\.\.([^=]+))?", text)
-    if match is None or match[1] not in KINDS:
+    match = re.fullmatch(r"(\w+(?:\[\d+\])?)(?::([^=]+))?(?:=([^=]+?)\.\.([^=]+))?", text)
+    field, _, column = (match[1] if match else "").rstrip("]").partition("[")
+    is_field = field not in KINDS and field in numbers_of(scene.model)
+    if match is None or not (match[1] in KINDS or is_field):
         raise ValueError(f"a parameter must be kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}")
     kind, names = match[1], tuple((match[2] or "").split(",")) if match[2] else ()
     try:
@@ -65,6 +64,8 @@ def parameter(scene: Scene, text: str) -> Parameter:
         return make(scene, **subset)
     if not names:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
+    if is_field:
+        return parameters.number(scene, field, *names, column=int(column) if column else None, bounds=bounds)
     if kind in _NAMED:
         return getattr(parameters, kind)(scene, *names, bounds=bounds)
     if len(names) > 1 or (bounds is not None and kind == "inertia"):
@@ -148,7 +149,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no archive of arrays")
     with np.load(path) as arrays:
-        wholes = {name: np.asarray(arrays[name], float) for name in arrays}
+        wholes = {name: np.asarray(real(name, arrays[name]), float) for name in arrays}
     wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
     return {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
 
@@ -262,9 +263,11 @@ def write_xml(scene: Scene, found: Scene, source: str | Path, path: str | Path) 
     spec = mujoco.MjSpec.from_file(str(source))
     model = spec.compile()
     before, after = numbers_of(scene.model), numbers_of(found.model)
-    for field in _WRITTEN:
-        old, new, present = (np.asarray(x, float) for x in (before[field], after[field], getattr(model, field)))
-        getattr(model, field)[:] = np.where(old != new, new, present)
+    for field in before:
+        place = getattr(model, field, None)
+        if isinstance(place, np.ndarray) and place.size == before[field].size:
+            old, new = (np.asarray(x[field], float).reshape(place.shape) for x in (before, after))
+            place[:] = np.where(old != new, new, place)
     spec.copy_back(model)
     for folder in ("meshdir", "texturedir"):
         there = Path(source).parent / (getattr(spec, folder) or "")

@@ -4,11 +4,12 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from mjxgrad.identification.files import column_names
-from mjxgrad.identification.recording import Recording, simulated, stack
+from mjxgrad.identification.motions import Motions
+from mjxgrad.identification.parameters import Parameter
+from mjxgrad.identification.recording import Recording, stack
 from mjxgrad.identification.result import Identification
 from mjxgrad.report import INK, Block, Table, page, svg
 from mjxgrad.scene import Scene
@@ -32,12 +33,16 @@ def identified_page(
 
 def _figures(scene: Scene, result: Identification, motions: Sequence[Recording]) -> Block:
     """Draw those signals of the last motion that the search changed most."""
-    window = jax.tree.map(lambda leaf: leaf[0], stack(scene, motions[-1:]))
-    run = jax.jit(lambda scene, delay, offset: simulated(scene, window, offset, delay)[0])
-    found = None if result.offsets is None else result.offsets[0]
-    ends = (scene, result.start, None), (result.scene, result.values, found)
-    courses = [run(scene, values.get("delay", 0.0), offset) for scene, values, offset in ends]
-    before, after = jax.tree.map(np.asarray, courses)
+    window, before, after = stack(scene, motions[-1:]), {}, {}
+    none = np.zeros((1, 1, 2 * scene.model.nv))
+    found = none if result.offsets is None else result.offsets[None, :1]
+    for curves, one, values, start in (
+        (before, scene, result.start, none),
+        (after, result.scene, result.values, found),
+    ):
+        delayed = Motions(one, {"delay": Parameter(0.0)}, delay="delay", contact=None)
+        signals = delayed.signals(window, np.full((1, 1), float(np.ravel(values.get("delay", 0.0))[0])), start)
+        curves |= {name: signal[0, 0] for name, signal in signals.items()}
     times = np.concatenate([motion.times for motion in motions])
     fitted_until = float(motions[0].times[-1]) if len(motions) > 1 else None
     names, signals = column_names(scene), []

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -24,6 +24,11 @@ Write = Callable[[mjx.Model, Array], dict[str, Array]]
 """Function from a model and the parameter's value to the changed fields of the model."""
 Bounds = tuple[float, float] | None
 _Object = mujoco.mjtObj
+_OBJECTS = {
+    "body": _Object.mjOBJ_BODY, "jnt": _Object.mjOBJ_JOINT, "dof": _Object.mjOBJ_JOINT, "geom": _Object.mjOBJ_GEOM,
+    "site": _Object.mjOBJ_SITE, "actuator": _Object.mjOBJ_ACTUATOR, "tendon": _Object.mjOBJ_TENDON,
+}  # fmt: skip
+_POSITIVE = ("dof_damping", "dof_armature", "dof_frictionloss", "body_mass", "geom_size", "jnt_stiffness")
 _FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
 _AT_BOUND = 1e-6  # share of the range
 # The bounds of `mujoco.sysid` for inertia: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre by 0.5 m.
@@ -63,24 +68,27 @@ class Parameter:
             raise ValueError(f"lower, nominal and upper must increase, nominal within them, got {given}")
 
 
-class Coordinates(eqx.Module):
-    """All parameters as one vector, and the search coordinates, in which each is scaled by its range.
+@dataclasses.dataclass(frozen=True)
+class Coordinates:
+    """All parameters as one vector, and the coordinates of the search, which begins at zero.
 
-    There is one of `names` per number, `mass` or `gains[1]`, and one of `shapes` per parameter, with its name.
+    A coordinate is the logarithm of a number whose bounds have one sign, relative to the nominal one; otherwise the distance
+    from that over the range, else over the distance to the only bound, else over its size. There is one of `names` per number,
+    `mass` or `gains[1]`, and one of `shapes` per parameter, with its name.
     """
 
-    nominal: Float[Array, " dim"]
-    lower: Float[Array, " dim"]
-    upper: Float[Array, " dim"]
-    names: tuple[str, ...] = eqx.field(static=True)
-    shapes: tuple[tuple[str, tuple[int, ...]], ...] = eqx.field(static=True)
+    nominal: Float[np.ndarray, " dim"]
+    lower: Float[np.ndarray, " dim"]
+    upper: Float[np.ndarray, " dim"]
+    names: tuple[str, ...]
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]
 
     @classmethod
     def of(cls, parameters: Mapping[str, Parameter]) -> "Coordinates":
         """Return the coordinates of named parameters, at least one."""
         if not parameters:
             raise ValueError("parameters must name at least one parameter, got none")
-        joined = lambda part: jnp.asarray(np.concatenate([getattr(p, part).ravel() for p in parameters.values()]))  # noqa: E731
+        joined = lambda part: np.concatenate([getattr(p, part).ravel() for p in parameters.values()])  # noqa: E731
         names = [
             name + "".join(f"[{i}]" for i in place if p.nominal.size > 1)
             for name, p in parameters.items()
@@ -96,24 +104,39 @@ class Coordinates(eqx.Module):
         return {name: vector[end - size : end].reshape(shape) for (name, shape), size, end in parts}  # pyright: ignore[reportIndexIssue]
 
     @property
-    def scale(self) -> Float[Array, " dim"]:
-        """The scale of each number in the search: its range, else the distance to its only bound, else its size."""
-        above, below = self.nominal - self.lower, self.upper - self.nominal
-        reach = jnp.where(jnp.isfinite(above), above, jnp.where(jnp.isfinite(below), below, jnp.abs(self.nominal)))
-        width = self.upper - self.lower
-        return jnp.where(jnp.isfinite(width), width, jnp.where(reach > 0, reach, 1.0))
+    def _is_logarithm(self) -> np.ndarray:
+        return (self.lower * self.upper > 0) & np.isfinite(self.lower) & np.isfinite(self.upper)
 
-    def values(self, free: Float[Array, "*points dim"]) -> Float[Array, "*points dim"]:
-        """Return the numbers at a point of the search, which begins at zero; points beyond a bound are clipped."""
-        return jnp.clip(self.nominal + self.scale * free, self.lower, self.upper)
+    @property
+    def scale(self) -> Float[np.ndarray, " dim"]:
+        """The scale of each number: its range, else the distance to its only bound, else its size."""
+        above, below, size = self.nominal - self.lower, self.upper - self.nominal, np.abs(self.nominal)
+        reach = np.where(np.isfinite(above), above, np.where(np.isfinite(below), below, size))
+        width = np.where(np.isfinite(self.upper - self.lower), self.upper - self.lower, reach)
+        return np.where(width > 0, width, 1.0)
 
-    def box(self) -> tuple[Float[Array, " dim"], Float[Array, " dim"]]:
-        """Return the bounds in search coordinates."""
-        return (self.lower - self.nominal) / self.scale, (self.upper - self.nominal) / self.scale
+    def values(self, point: Float[np.ndarray, "*points dim"]) -> Float[np.ndarray, "*points dim"]:
+        """Return the numbers at a point of the search; points beyond a bound are clipped."""
+        with np.errstate(over="ignore"):
+            grown = self.nominal * np.exp(np.where(self._is_logarithm, point, 0.0))
+        return np.clip(np.where(self._is_logarithm, grown, self.nominal + self.scale * point), self.lower, self.upper)
 
-    def is_at_bound(self, values: Float[Array, " dim"]) -> Bool[Array, " dim"]:
+    def rates(self, values: Float[np.ndarray, " dim"]) -> Float[np.ndarray, " dim"]:
+        """Return the derivative of each number by its coordinate."""
+        return np.where(self._is_logarithm, values, self.scale)
+
+    def box(self) -> tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]:
+        """Return the bounds of the coordinates."""
+        safe = np.where(self._is_logarithm, self.nominal, 1.0)
+        ends = []
+        for bound in (self.lower, self.upper):
+            ratio = np.where(self._is_logarithm, bound, 1.0) / safe
+            ends.append(np.where(self._is_logarithm, np.log(ratio), (bound - self.nominal) / self.scale))
+        return np.minimum(*ends), np.maximum(*ends)
+
+    def is_at_bound(self, values: Float[np.ndarray, " dim"]) -> Bool[np.ndarray, " dim"]:
         """Return whether each number is at a bound, up to rounding."""
-        return jnp.minimum(values - self.lower, self.upper - values) < _AT_BOUND * self.scale
+        return np.minimum(values - self.lower, self.upper - values) < _AT_BOUND * self.scale
 
 
 def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping[str, Array]) -> Scene:
@@ -199,26 +222,53 @@ def _touching(scene: Scene, named: Softness) -> Pairs:
 
 def damping(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the damping of a joint, or the common damping of several (N s/m or N m s/rad); otherwise as `mass`."""
-    return _of_joints(scene, "dof_damping", joints, bounds)
+    return number(scene, "dof_damping", *joints, bounds=bounds)
 
 
 def armature(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the armature of a joint, or the common armature of several (kg or kg m²); otherwise as `mass`."""
-    return _of_joints(scene, "dof_armature", joints, bounds)
+    return number(scene, "dof_armature", *joints, bounds=bounds)
 
 
 def friction_loss(scene: Scene, *joints: str, bounds: Bounds = None) -> Parameter:
     """Return the dry friction of a joint, or the common friction of several (N or N m); otherwise as `mass`."""
-    return _of_joints(scene, "dof_frictionloss", joints, bounds)
+    return number(scene, "dof_frictionloss", *joints, bounds=bounds)
 
 
 def gear(scene: Scene, *actuators: str, bounds: Bounds = None) -> Parameter:
     """Return the first gear number of an actuator, or the common one of several; otherwise as `mass`."""
+    return number(scene, "actuator_gear", *actuators, column=0, bounds=bounds)
 
-    def place(model: mjx.Model) -> tuple:
-        return np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators]), 0
 
-    return _common(scene, "actuator_gear", place, bounds, "gear")
+def number(scene: Scene, field: str, *names: str, column: int | None = None, bounds: Bounds = None) -> Parameter:
+    """Return a number of a field of the model, or the common number of several elements; otherwise as `mass`.
+
+    A link of an arm is as long as `number(scene, "body_pos", "forearm", column=2)` says where the next body begins.
+
+    Args:
+        scene: the scene with nominal values.
+        field: MuJoCo's name, such as "jnt_stiffness"; of joints' velocities "dof_damping".
+        names: bodies, joints, geoms, actuators or others, as the field's name begins.
+        column: which of an element's numbers; None for a field that has one.
+        bounds: least and greatest value; needed where the number is not positive.
+
+    Raises:
+        ValueError: if there is no such field, element or column.
+    """
+    start = field.partition("_")[0]
+    if start not in _OBJECTS or not isinstance(value := getattr(scene.model, field, None), jax.Array):
+        raise ValueError(f"field must be one of the model's that begins with {', '.join(_OBJECTS)}, got {field!r}")
+    if value.ndim != 1 + (column is not None) or (column is not None and not 0 <= column < value.shape[1]):
+        raise ValueError(f"column of {field} must be one of {value.shape[1:] or 'none'}, got {column}")
+    index = np.array([index_of(scene.model, _OBJECTS[start], name) for name in names])
+    if start == "dof":
+        index = np.flatnonzero(np.isin(scene.model.dof_jntid, index))
+    place: Any = index if column is None else (index, column)
+
+    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
+        return {field: getattr(model, field).at[place].set(value)}
+
+    return _positive(float(value[place][0]), bounds, write, "", field.removeprefix("dof_"), field in _POSITIVE)
 
 
 def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
@@ -237,24 +287,9 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
     return _positive(-np.asarray(scene.model.actuator_biasprm)[index, 1:3], bounds, write, "", "gains")
 
 
-def _of_joints(scene: Scene, field: str, joints: tuple[str, ...], bounds: Bounds) -> Parameter:
-    def place(model: mjx.Model) -> tuple:
-        index = [index_of(model, _Object.mjOBJ_JOINT, joint) for joint in joints]
-        return (np.flatnonzero(np.isin(model.dof_jntid, index)),)
-
-    return _common(scene, field, place, bounds, field.removeprefix("dof_"))
-
-
-def _common(scene: Scene, field: str, place: Callable[[mjx.Model], tuple], bounds: Bounds, name: str) -> Parameter:
-    """Return the common number at some places of a model's array."""
-
-    def write(model: mjx.Model, value: Array) -> dict[str, Array]:
-        return {field: getattr(model, field).at[place(model)].set(value)}
-
-    return _positive(float(getattr(scene.model, field)[place(scene.model)][0]), bounds, write, "", name)
-
-
-def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: str, name: str) -> Parameter:
+def _positive(
+    nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: str, name: str, is_positive: bool = True
+) -> Parameter:
     nominal = np.asarray(nominal, float)
     if bounds is None:
         if not (nominal > 0).all():
@@ -262,7 +297,7 @@ def _positive(nominal: Any, bounds: tuple[Any, Any] | None, write: Write, unit: 
         bounds = (nominal / _FACTOR, nominal * _FACTOR)
     if np.shape(bounds)[:1] != (2,) or not np.all(np.asarray(bounds[0]) < np.asarray(bounds[1])):
         raise ValueError(f"bounds of {name} must be two numbers that increase, got {bounds}")
-    if name != "gear" and np.any(np.asarray(bounds[0]) < 0):
+    if is_positive and np.any(np.asarray(bounds[0]) < 0):
         raise ValueError(f"bounds of {name} must not be negative, got {bounds[0]}")
     return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)
 

@@ -2,24 +2,21 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mjxgrad._arrays import instance, real
 from mjxgrad._mjx import mjx
-from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.bodies.tree import joint_runs
-from mjxgrad.rollouts import State, initial_state, rollout
+from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, sensor
-from mjxgrad.stepping import Contact
 
 STATES = ("qpos", "qvel", "act")
+_AROUND = 6  # rows on each side that tell a speed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +56,18 @@ class Recording:
             if name != "controls" and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
                 raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
-        lengths = {len(v) for v in rows.values()} | (set() if self.times is None else {len(self.times)})
-        if len(lengths) != 1 or 0 in lengths:
-            raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {lengths}")
+        counts = {name: len(v) for name, v in rows.items()} | ({} if self.times is None else {"times": len(self.times)})
+        lengths = set(counts.values())
+        if not rows or 0 in lengths:
+            raise ValueError(
+                f"measured of {self.name} must hold at least one row of some signal, got {counts or 'none'}"
+            )
+        if len(lengths) > 1:
+            raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {counts}")
+        if infinite := [name for name, v in rows.items() if np.isinf(v).any()]:
+            raise ValueError(
+                f"measured of {self.name} must be finite, or NaN for none, got infinity in {', '.join(infinite)}"
+            )
         count = len(self.controls) if self.controls is not None else None
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
             needed = f"{count + 1} rows for {count} controls, one at each state, or times"
@@ -76,44 +82,60 @@ class Recording:
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
         """Return windows of a duration (s) at the scene's time step (s), each from a measured state; the rest is dropped.
 
-        Short windows keep a motion that is hard to predict close to the measurements. Their starts are as noisy as the
-        measurements: `free_start=True` of `identify` estimates them, too.
+        `identify` needs none: its horizon grows by itself. Windows are as noisy at their starts as the measurements, so that on
+        a floor each begins with a small bounce, which biases friction. Speeds that were not measured are those of a parabola
+        through the places about each start.
 
         Raises:
-            ValueError: if positions or velocities were not measured, or no window fits.
+            ValueError: if positions were not measured, or no window fits.
         """
-        if not {"qpos", "qvel"} <= set(self.measured):
-            raise ValueError(f"{self.name} must have measured qpos and qvel to be cut, got {sorted(self.measured)}")
-        times = _times(self, timestep)
+        if "qpos" not in self.measured:
+            raise ValueError(f"{self.name} must have measured qpos to be cut, got {sorted(self.measured)}")
+        measured, noise, times = dict(self.measured), dict(self.noise), _times(self, timestep)
         begins = np.arange(times[0], times[-1] - duration + timestep / 2, duration)
         if not begins.size:
             raise ValueError(f"duration must be at most that of {self.name}, {times[-1]:g} s, got {duration:g} s")
+        firsts = np.searchsorted(times, begins - timestep / 2)
+        if "qvel" not in measured:
+            measured["qvel"], noise["qvel"] = _speeds(times, measured["qpos"], firsts, noise.get("qpos", 1.0))
         controls, at = self.controls, self.control_times
         if controls is not None and at is None:
             at = timestep * np.arange(len(controls))
         windows = []
         for begin in begins:
             rows = np.flatnonzero((times >= begin - timestep / 2) & (times <= begin + duration + timestep / 2))
-            measured = {name: value[rows] for name, value in self.measured.items()}
+            own = {name: value[rows] for name, value in measured.items()}
             start, name, after = times[rows[0]], f"{self.name} from {times[rows[0]]:g} s", times[rows] - times[rows[0]]
             kept = np.zeros(0, bool) if at is None else at - start > -timestep / 2
             given = (None, None) if at is None else (np.asarray(controls)[kept], np.maximum(at[kept] - start, 0))
-            windows.append(Recording(measured, given[0], after, given[1], self.noise, None, name, self.knows_noise))
+            windows.append(Recording(own, given[0], after, given[1], noise, None, name, self.knows_noise))
         return windows
 
 
-class Windows(eqx.Module):
+def _speeds(times: np.ndarray, qpos: np.ndarray, firsts: np.ndarray, noise: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return speeds in some rows, NaN in others, and their noise: parabolas through a few places about each, by their length."""
+    found, errors = np.full(qpos.shape, np.nan), []
+    for row in firsts.tolist():
+        near = slice(max(row - _AROUND, 0), row + _AROUND + 1)
+        at = times[near] - times[row]
+        inverse = np.linalg.pinv(at[:, None] ** np.arange(min(3, len(at))))
+        found[row] = inverse[1] @ qpos[near]
+        errors.append(np.linalg.norm(inverse[1]))
+    return found, 2.0 * np.median(errors) * np.broadcast_to(np.asarray(noise, float), qpos.shape[1:])
+
+
+class Windows(NamedTuple):
     """Recordings of one scene as a batch; shorter ones are padded by rows of weight zero.
 
     A measurement is a share of a step after the state with its index. Weights are 1 / noise, 0 where nothing was measured.
     """
 
     state: State
-    controls: Float[Array, "*windows steps nu"]
-    index: Int[Array, "*windows rows"]
-    share: Float[Array, "*windows rows"]
-    measured: dict[str, Float[Array, "*windows rows _"]]
-    weight: dict[str, Float[Array, "*windows rows _"]]
+    controls: Float[np.ndarray, "windows steps nu"]
+    index: Int[np.ndarray, "windows rows"]
+    share: Float[np.ndarray, "windows rows"]
+    measured: dict[str, Float[np.ndarray, "windows rows _"]]
+    weight: dict[str, Float[np.ndarray, "windows rows _"]]
 
 
 def stack(scene: Scene, recordings: Sequence[Recording]) -> Windows:
@@ -127,7 +149,7 @@ def stack(scene: Scene, recordings: Sequence[Recording]) -> Windows:
     names = list(dict.fromkeys(name for one in recordings for name in one.measured))
     num_steps, num_rows = max(steps), max(len(_times(one, timestep)) for one in recordings)
     parts = [_window(scene, one, names, num_steps, num_rows) for one in recordings]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
 
 
 def _times(recording: Recording, timestep: float) -> np.ndarray:
@@ -165,10 +187,10 @@ def _window(scene: Scene, recording: Recording, names: list[str], num_steps: int
             is_there = np.stack([given[:, one].all(axis=1) for one in coordinates(scene.model)], axis=1)
             if any(given[:, one].any() and not given[:, one].all(axis=1).any() for one in coordinates(scene.model)):
                 raise ValueError(f"qpos of {recording.name} must have all four numbers of a quaternion, or none")
-        weight[name] = jnp.asarray(np.pad(is_there / noise, (spare, (0, 0))))
-        measured[name] = jnp.asarray(np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge"))
-    controls = jnp.asarray(_controls(scene, recording, num_steps, timestep))
-    index, share = (jnp.asarray(np.pad(x, spare)) for x in (index, place - index))
+        weight[name] = np.pad(is_there / noise, (spare, (0, 0)))
+        measured[name] = np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge")
+    controls = _controls(scene, recording, num_steps, timestep)
+    index, share = (np.pad(x, spare) for x in (index, place - index))
     return Windows(start_of(scene, recording, times), controls, index, share, measured, weight)
 
 
@@ -195,8 +217,9 @@ def after_start(windows: Windows, spread: Float[np.ndarray, "windows both"]) -> 
     weight = dict(windows.weight)
     for name, noise in zip(("qpos", "qvel"), np.split(spread, 2, axis=1), strict=True):
         if name in weight:
-            weight[name] = weight[name].at[:, 0].multiply(noise == 0)
-    return eqx.tree_at(lambda w: w.weight, windows, weight)
+            weight[name] = weight[name].copy()
+            weight[name][:, 0] *= noise == 0
+    return windows._replace(weight=weight)
 
 
 def coordinates(model: mjx.Model | mujoco.MjModel) -> list[slice]:
@@ -239,48 +262,3 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
         at = timestep * np.arange(num_steps)
         return np.column_stack([np.interp(at, recording.control_times, column) for column in controls.T])
     return np.pad(controls[:num_steps], ((0, max(0, num_steps - len(controls))), (0, 0)), mode="edge")
-
-
-def simulated(
-    scene: Scene, window: Windows, offset: Float[Array, " both"] | None, delay: Float[Array, ""] | None, **settings: Any
-) -> tuple[dict[str, Array], Bool[Array, ""]]:
-    """Return all signals of a simulated window by name, at the scene's own steps, and whether it diverged; traceable.
-
-    The offset changes the start, positions and velocities (m, rad, m/s, rad/s). The delay (s) is of the controls.
-    """
-    model, state, controls = scene.model, window.state, window.controls
-    if offset is not None:
-        qpos = integrate_position(model, state.qpos, offset[: model.nv], 1.0)
-        state = eqx.tree_at(lambda s: (s.qpos, s.qvel), state, (qpos, state.qvel + offset[model.nv :]))
-    if delay is not None:
-        at = jnp.arange(len(controls), dtype=controls.dtype)
-        controls = jax.vmap(lambda u: jnp.interp(at - delay / model.opt.timestep, at, u), 1, 1)(controls)
-    sensors = [name for name in window.measured if name not in STATES]
-
-    def observe(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
-        return {name: sensor(model, data, name) for name in sensors}
-
-    course = rollout(scene, state, controls, checkpoint=False, observe=observe if sensors else None, **settings)
-    return {name: getattr(course, name) for name in STATES} | (course.observations or {}), course.diverged
-
-
-def residuals(
-    scene: Scene,
-    window: Windows,
-    offset: Float[Array, " both"] | None,
-    delay: Float[Array, ""] | None,
-    *,
-    contact: Contact,
-) -> tuple[Float[Array, " numbers"], Bool[Array, ""]]:
-    """Return the `simulated` less the measured signals of one window, in units of the noise, and whether it diverged."""
-    found, diverged = simulated(scene, window, offset, delay, contact=contact)
-    parts = []
-    for name, measured in window.measured.items():
-        before, after = found[name][window.index], found[name][window.index + 1]
-        change = before + window.share[:, None] * (after - before)
-        if name == "qpos":
-            change = jax.vmap(position_change, (None, 0, 0))(scene.model, measured, change)
-        else:
-            change -= measured
-        parts.append(change * window.weight[name])
-    return jnp.concatenate(parts, axis=1).ravel(), diverged

@@ -15,7 +15,6 @@ import enum
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import scipy.linalg
 import scipy.special
@@ -29,6 +28,7 @@ from mjxgrad.scene import Scene
 _LEVEL = 0.95
 _SMALL_PART = 0.05  # least share in a combination for a number to be named
 _NOT_TOLD_APART = 1e-6  # of the largest singular value: the data would have to be a million times better
+_TIED = 0.9  # correlation of errors that is told
 _RELATED = 0.5  # correlation of residuals that makes intervals too narrow by √3
 _REMOVED = 1e-3  # of the residuals at the start: less comes from numerical differences
 _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred times
@@ -46,6 +46,53 @@ class Stopped(enum.Enum):
     STALLED = "stalled"
     STEPS = "max_steps reached"
     INTERRUPTED = "interrupted"
+
+
+@dataclasses.dataclass(frozen=True)
+class Outlook(Printed):
+    """Foretell at the nominal values how well recordings tell parameters, and the price of a search.
+
+    Attributes:
+        coordinates: bounds and names.
+        told: the fields of `statistics`: intervals for noise as stated and contacts that do not chatter.
+        seconds: duration of a search, about.
+        num_motions: motions of all windows that it takes, about.
+        num_windows: windows, each of `num_steps` steps.
+        num_steps: steps of a window.
+    """
+
+    coordinates: Coordinates
+    told: dict[str, Any]
+    seconds: float
+    num_motions: int
+    num_windows: int
+    num_steps: int
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a table of text, header first: name, standard error that the recordings allow, and what it goes with."""
+        errors = np.sqrt(np.diag(self.told["covariance"]))
+        sizes = np.where(self.coordinates.nominal != 0, np.abs(self.coordinates.nominal), self.coordinates.scale)
+        rows = [("parameter", "standard error", "goes with")]
+        for name, error, partners in zip(
+            self.coordinates.names, errors / sizes, _partners(self.told, self.coordinates), strict=True
+        ):
+            rows.append((name, f"{100 * error:.2g} %" if np.isfinite(error) else "not told", partners))
+        return rows
+
+    def summary(self) -> str:
+        """Say the price, and what the recordings tell at the nominal values."""
+        count = self.num_windows
+        windows = f"{count} recording{'s' * (count > 1)} of {self.num_steps} steps"
+        price = f"About {format_number(self.seconds)} s: {self.num_motions} motions of {windows}."
+        lost = [*self.told["without_effect"], *(" with ".join(one) for one in self.told["inseparable"])]
+        told = (
+            f"At the first values not told: {'; '.join(lost)}."
+            if lost
+            else "Every number is told, at the first values:"
+        )
+        return "\n".join([price, told, *(f"  {line}" for line in aligned(self.rows()))])
+
+    __str__ = summary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +118,7 @@ class Identification(Printed):
             mean, over the covariance of noise and chatter.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
+        seconds: duration of the search.
         stopped: the reason why the search ended.
         scene: the scene with the identified values.
         coordinates: bounds and names, for saving.
@@ -94,6 +142,7 @@ class Identification(Printed):
     num_motions: int
     num_numbers: int
     num_steps: int
+    seconds: float
     stopped: Stopped
     scene: Scene
     coordinates: Coordinates
@@ -115,23 +164,34 @@ class Identification(Printed):
 
     @property
     def headline(self) -> str:
-        """The answer, in at most 15 words."""
-        lost = int(np.isinf(np.concatenate([np.ravel(half) for half in self.half_width.values()])).sum())
-        if self.stopped is not Stopped.CONVERGED:
-            ended = {Stopped.STALLED: "stalled", Stopped.STEPS: "was cut short"}.get(self.stopped, "was interrupted")
-            return f"The search {ended}: do not trust the values."
-        count = len(self.names)
-        found = f"{count - lost} of {count} numbers found" if lost else f"All {count} found" if count > 1 else "Found"
-        if self.at_bounds and not lost:
+        """The answer: what was found, how surely, whether it fits, and what it took."""
+        values, halves = (
+            np.concatenate([np.ravel(x) for x in part.values()]) for part in (self.values, self.half_width)
+        )
+        count, is_lost = len(self.names), np.isinf(halves)
+        shares = 100 * (halves / np.where(values != 0, np.abs(values), np.inf))[~is_lost]
+        surely = f" to {_percent(shares)} %" if (shares > 0).any() else ""
+        found = f"All {count} found{surely}" if count > 1 else f"Found{surely}"
+        if self.at_bounds:
             found = f"{len(self.at_bounds)} of {count} numbers ended at a bound"
+        if is_lost.any():
+            found = f"{count - is_lost.sum()} of {count} numbers found"
         if self._is_unexplained:
             found = "Not found, for more than noise is left"
+        ended = {
+            Stopped.STALLED: "Do not trust: stalled",
+            Stopped.STEPS: "Cut short",
+            Stopped.INTERRUPTED: "Interrupted",
+        }
+        if self.stopped in ended:
+            found = f"{ended[self.stopped]}, best so far"
         before, after, *held_out = (
             f"{one:.3g}" if self.has_noise else f"{100 * one:.2g} %" if one < 0.995 else f"{100 * one:.0f} %"
             for one in (*self.rms, *(self.held_out_rms or ())[1:])
         )
         unit = "times the noise" if self.has_noise else "of the motion"
-        return f"{found}: error {after} {unit}, {before} before{'; held out ' * bool(held_out)}{''.join(held_out)}."
+        judged = f"; held out {held_out[0]}" if held_out else ""
+        return f"{found}: error {after} {unit}, {before} before{judged}; {format_number(self.seconds)} s."
 
     def summary(self) -> str:
         """Describe the result in text: the values with their intervals, then the warnings."""
@@ -149,31 +209,32 @@ class Identification(Printed):
     __str__ = summary
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return the values as a table of text, header first: name and unit, value, interval, start, bounds."""
+        """Return the values as a table of text, header first: name and unit, value, interval, start, bounds, what goes with it."""
         parts = (self.values, self.half_width, self.start)
         columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
-        bounds = zip(on_host(self.coordinates.lower), on_host(self.coordinates.upper), strict=True)
-        rows = [("parameter", "found", "± 95 %", "start", "bounds")]
-        for name, found, half, start, (low, high) in zip(self.names, *columns, bounds, strict=True):
+        told = {"covariance": self.covariance, "inseparable": self.inseparable}
+        columns += [self.coordinates.lower, self.coordinates.upper, _partners(told, self.coordinates)]
+        rows = [("parameter", "found", "± 95 %", "start", "bounds", "goes with")]
+        for name, found, half, start, low, high, partners in zip(self.names, *columns, strict=True):
             unit = self.units.get(name.split("[")[0], "")
             shown = (_digits(found, half), f"{half:.2g}" if np.isfinite(half) else "unknown", format_number(start))
             title = f"{name} ({unit})" if unit else name
-            rows.append((title, *shown, f"{format_number(low)} to {format_number(high)}"))
-        return rows
+            rows.append((title, *shown, f"{format_number(low)} to {format_number(high)}", partners))
+        return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
 
     def warnings(self) -> list[str]:
         """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""
         found = []
         if self.has_noise and self._is_unexplained:
-            free = "" if self.offsets is not None or self.num_motions > 1 else "free_start=True (--start free), "
+            free = "" if self.offsets is not None else "free_start=True (--start free), "
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "
                 "move as recorded, or the search ended in a local minimum; values may be off by more than their intervals. Try "
-                f"other first values, {free}shorter windows (recording.cut) or more parameters, or correct the noise."
+                f"other first values, {free}more parameters, or correct the noise."
             )
         if self.stopped is Stopped.STALLED:
             found.append(
-                "Stalled: the mean of many motions does not settle. Give narrower bounds, shorter windows or softer contact."
+                "Stalled: the mean of many motions does not settle. Give narrower bounds, shorter recordings or softer contact."
             )
         after, is_enough = self.rms[1], self.num_numbers >= _ENOUGH
         if self.has_noise and after < _OVERSTATED and is_enough:
@@ -218,16 +279,15 @@ class Identification(Printed):
 def statistics(
     coordinates: Coordinates,
     values: Float[np.ndarray, " dim"],
-    residual: Float[np.ndarray, " numbers"],
-    slope: Float[np.ndarray, "numbers dim"],
+    squares: float,
+    slope: Float[np.ndarray, "rows dim"],
     num_numbers: int,
     num_offsets: int,
-    away: Float[np.ndarray, "dim dim"] | float = 0.0,
 ) -> dict[str, Any]:
     """Return the fields of `Identification` that residuals at the end and their derivative tell, half widths as a vector.
 
-    The derivative is by the values, orthogonal to the effect of the starts, which are `num_offsets` more unknowns. Of the
-    residuals `num_numbers` are measurements. The second moment of other values that fit as well is `away`.
+    The derivative is by the values, orthogonal to the effect of the starts, which are `num_offsets` more unknowns; it is of the
+    residuals, or has the same products. There are `num_numbers` measurements.
     """
     rounding = float(np.finfo(np.asarray(coordinates.nominal).dtype).eps)
     lengths = np.linalg.norm(slope, axis=0)
@@ -239,10 +299,8 @@ def statistics(
     blurred = right[~is_clear]
     spread = np.where(is_clear, 1 / np.where(sizes > 0, sizes, 1.0), 0.0)[:, None] * right / lengths[is_felt]
     freedom = max(num_numbers - num_offsets - int(is_clear.sum()), 1)
-    variance = residual @ residual / freedom
     covariance = np.full((len(values), len(values)), np.nan)
-    covariance[np.ix_(is_felt, is_felt)] = variance * spread.T @ spread
-    covariance += away
+    covariance[np.ix_(is_felt, is_felt)] = squares / freedom * spread.T @ spread
     lost = ~is_felt
     lost[np.flatnonzero(is_felt)[(blurred**2).sum(axis=0) > _NO_PART**2]] = True
     covariance[lost], covariance[:, lost] = np.nan, np.nan
@@ -277,14 +335,27 @@ def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) ->
     return tuple(found)
 
 
+def _partners(told: dict[str, Any], coordinates: Coordinates) -> list[str]:
+    """Return for each number the others with which its error goes, at a correlation of more than 0.9."""
+    covariance, names = told["covariance"], coordinates.names
+    errors = np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        related = np.abs(covariance / np.outer(errors, errors)) > _TIED
+    np.fill_diagonal(related, False)
+    for combination in told["inseparable"]:
+        index = [names.index(name) for name in combination]
+        related[np.ix_(index, index)] = ~np.eye(len(index), dtype=bool)
+    return [", ".join(np.array(names)[row].tolist()) for row in related]
+
+
+def _percent(shares: np.ndarray) -> str:
+    low, high = ("<0.01" if x < 0.01 else f"{x:.1g}" for x in (shares.min(), shares.max()))
+    return high if low == high else f"{low}–{high}"
+
+
 def _digits(value: float, half_width: float) -> str:
     """Return a value to the second digit of its interval."""
     if not (np.isfinite(half_width) and half_width > 0 and value):
         return format_number(value)
     digits = int(np.clip(np.ceil(np.log10(abs(value) / half_width)) + 2, 2, 9))
     return f"{value:.{digits}g}"
-
-
-def on_host(tree):
-    """Return arrays of NumPy in double precision."""
-    return jax.tree.map(lambda x: np.asarray(x, float), tree)

@@ -1,55 +1,66 @@
-r"""The search: residuals of all recordings in one program, their derivative in forward mode, and a trust region.
+r"""The search: nonlinear least squares by differences of whole motions, over horizons that grow.
 
-One program rolls out all windows of a scene under `jax.vmap`, with one tangent per parameter. The unknown start of a window
-affects that window alone, so the tangents of the starts do not grow with the number of windows. Each step of the search asks
-this program for residuals and derivative at one point, and SciPy chooses the next by their linear model. Where no single
-motion fits, or the sum of squares is rugged, the values are those of an ensemble.
+A derivative is a secant: two motions that a number parts by a share of what is still left to explain. Far from the answer it
+spans the teeth that contacts give a sum of squares, and ever fewer of them as the fit improves. The first eighth of a motion is
+nearly linear in its numbers and depends little on chatter; what it tells is where the search begins on a quarter, and so on.
+The unknown start of a window affects that window alone, so that one pair of motions of all windows tells each its own.
+Where the sum of squares is rugged at its least value, the values are those of an ensemble.
 """
 
-import contextlib
-import itertools
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
-import scipy.optimize
-import scipy.special
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjxgrad._arrays import function, instance, whole
-from mjxgrad._programs import compile_once
-from mjxgrad.engines import QUICK
-from mjxgrad.identification.ensemble import Ensemble, fit
-from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
-from mjxgrad.identification.recording import STATES, Recording, Windows, after_start, residuals, spread, stack
-from mjxgrad.identification.result import CHANCE, Identification, Stopped, exceeds_noise, on_host, statistics
+from mjxgrad.identification.ensemble import MISFIT, Ensemble, Regression, fit, size as ensemble_size
+from mjxgrad.identification.motions import Motions
+from mjxgrad.identification.normal import factors_of, solved, split
+from mjxgrad.identification.parameters import Parameter
+from mjxgrad.identification.recording import Recording, Windows, after_start, spread, stack
+from mjxgrad.identification.result import Identification, Outlook, Stopped, exceeds_noise, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Discrete
+from mjxgrad.stepping import Contact
 
 Log = Callable[[int, dict[str, float]], None] | None
-_TOO_LITTLE = 1e-3  # gain of a step at the end, of the noise variance
-_LEFT, _DOUBT = 0.3, 0.05  # of the first residuals; chance of noise alone, below which better values are sought
-_NUM_AWAY, _CLEAR = 5, 1e-10  # points a standard error away; share of the largest curvature that counts
-_RUGGED = 10.0  # growth of the sum of squares over what its derivatives foretell
-_BETTER = 1.1  # residuals of one motion over the ensemble's at most
-_SHORT, _AGREE = 10, 4  # steps of a descent from a motion that nearly fits; ends alike at which no better one is sought
-_MOST_AT_ONCE, _SIDE_BY_SIDE = 256, 64  # motions in one call, and in one batch, for memory
+_HORIZONS = (0.125, 0.25, 0.5, 1.0)  # of the steps
+_WIDE, _NARROW = 0.3, 0.5  # widths of secants: of what is left to explain; of a standard error
+_FIRST, _WIDEST = 0.02, 0.2  # widths of secants by a coordinate
+_DAMPED, _EASED, _RAISED = (1e-2, 1e4), 0.25, 6.0  # damping: first and last; factors
+_ENOUGH, _CLOSE = (
+    1e-2,
+    1e-6,
+)  # relative gain of an early step at which the horizon grows; square of standard errors to go
+_LONGEST = 1.0  # step in a coordinate at most
+_TRIALS = (12, 40)  # steps tried at an early horizon and at the last
+_NUM_AWAY, _AWAY, _RUGGED = 12, 2.0, 0.2  # motions and their standard errors away; share of changes that is not linear
+_EXACT = 1e-6  # of the first residuals: nothing is left
+_LEFT = 0.3  # of the first residuals, above which better values are sought where the noise is not known
+_SCATTERED, _BEST = 256, 3  # motions between the bounds, and those from which descents begin anew
+_SPREAD = 0.05  # of a coordinate, by which the first motions of an ensemble differ at least
+_DESCENT, _ENSEMBLES = 24, 7  # derivatives of whole motions, and ensembles, that a search takes, about
+_CORE = 0.3  # of the noise or of the first residuals, beyond which a residual of these counts by its logarithm
+
+
+class Point(NamedTuple):
+    """Coordinates of the values, and changes of the starts of windows."""
+
+    values: Float[np.ndarray, " dim"]
+    starts: Float[np.ndarray, "windows free"]
 
 
 class _End(NamedTuple):
-    """The end of a descent: the best point, and how the search came there."""
+    """The end of a descent or of an ensemble: the point, factors of residuals and derivative there, and the sum of squares."""
 
-    point: Array
-    found: tuple[Array, ...]  # residuals and their derivatives there
-    num_steps: int
-    stopped: Stopped
-    first: float  # root mean square of the residuals at the start
-    away: Float[np.ndarray, "dim dim"] | float = 0.0  # second moment of the distances to other ends
+    point: Point
+    factors: Float[np.ndarray, "windows rows columns"]
+    squares: float
+    residual: Float[np.ndarray, "windows numbers"] | None  # of a single motion
+    many: Ensemble | None = None
 
 
 def identify(
@@ -66,24 +77,23 @@ def identify(
 ) -> Identification:
     r"""Identify parameters of a scene from recorded motions, through contact.
 
-    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by a trust region with
-    derivatives through the simulation. Where contacts chatter, no motion fits: then the mean of many motions is fitted,
-    between the bounds, with starts as noisy as they were measured, and the intervals include the chatter. Ctrl-C ends the
-    search with the best values so far.
+    Minimises $\sum (y_\text{simulated}(\theta) - y_\text{measured})^2 / \text{noise}^2$ by differences of whole motions. Where
+    contacts chatter, a single motion tells little: then the mean of many motions is fitted, and the intervals include the
+    chatter. Ctrl-C ends the search with the best values so far.
 
     Args:
         scene: the scene with nominal values.
-        parameters: parameters by name, from `mass`, `friction`, `softness` and the like, or a `Parameter` of your own.
+        parameters: parameters by name, from `mass`, `friction`, `number` and the like, or a `Parameter` of your own.
         recordings: recordings of the scene.
         held_out: recordings for validation only.
         delay: name of the parameter that delays the controls beyond the recorded times (s); None for no delay.
         free_start: whether the starts are unknown, too. None is for those that are the first row of a recording, as far as it
             was measured, and as noisy; True is for all; with False all are exact.
-        contact: as in `rollout`. None is MuJoCo's motion, which recordings by MuJoCo need, for the intervals do not cover the
-            error of another one. It is by MJX, but in single precision by C MuJoCo where joints alone were measured, since
-            chattering contacts need double precision. `mg.Onset()` is a smoother motion, for recordings of real things.
-        max_steps: largest number of simulations with derivatives; those of many motions without are not counted.
-        log: called after each step, or ensemble of motions, as `log(step, {"rms": ..., "is_accepted": ...})`.
+        contact: as in `rollout`. None is MuJoCo's motion, by C MuJoCo, which recordings by MuJoCo need, for the intervals do
+            not cover the error of another one. `mg.Onset()` is a smoother motion, for recordings of real things.
+        max_steps: largest number of derivatives; motions of an ensemble are not counted.
+        log: called as `log(step, {"rms": ..., "share": ..., "seconds": ...})` after each derivative or ensemble, with the
+            share of the motions that was simulated, and the seconds that are left, about; step 0 is the nominal motion.
 
     Returns:
         The values, their intervals, and undetermined parameters; `print(result.summary())`.
@@ -92,6 +102,54 @@ def identify(
         ValueError: if there are no parameters or recordings, nothing was measured, or shapes do not fit the scene.
         DivergedError: if the simulation diverges with the nominal values.
     """
+    given = _checked(scene, parameters, recordings, delay, free_start, contact)
+    instance("held_out", held_out, Sequence, "a list of recordings")
+    for part in held_out:
+        instance("recordings", part, Recording, "of mg.identification.Recording")
+    function("log", log, "step", "metrics")
+    search = _Search(given, whole("max_steps", max_steps), log)
+    has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
+    try:
+        stopped = search.run(has_noise)
+    except KeyboardInterrupt:
+        search.keep_latest()
+        stopped = Stopped.INTERRUPTED
+    return _identified(search, stopped, held_out, has_noise)
+
+
+def outlook(
+    scene: Scene,
+    parameters: Mapping[str, Parameter],
+    recordings: Sequence[Recording],
+    *,
+    delay: str | None = None,
+    free_start: bool | None = None,
+    contact: Contact | None = None,
+) -> Outlook:
+    """Return what recordings can tell of parameters, and what a search would take, before `identify` with these arguments.
+
+    The relative errors are those of a linear model at the nominal values, if the noise is as stated and contacts do not chatter.
+
+    Raises:
+        ValueError: as `identify`.
+        DivergedError: as `identify`.
+    """
+    search = _Search(_checked(scene, parameters, recordings, delay, free_start, contact), 1, None)
+    problem, start = search.problem, search.end
+    widths = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], 0.3)
+    linear = search.linear(start.point, start.residual, widths, problem.num_steps, 1.0)
+    factors = factors_of(start.residual, linear.slope, linear.by_start)
+    seconds, num = search.price(search.is_rugged(linear, start.point, 1.0))
+    coordinates = problem.motions.coordinates
+    slope = _slope(problem, factors, coordinates.nominal)
+    found = statistics(coordinates, coordinates.nominal, float(problem.num_numbers), slope, problem.num_numbers, 0)
+    return Outlook(coordinates, found, seconds, num, problem.windows.index.shape[0], problem.num_steps)
+
+
+def _checked(
+    scene: Scene, parameters: Mapping[str, Parameter], recordings: Sequence[Recording], delay: Any, free_start: Any,
+    contact: Contact | None,
+) -> "_Problem":  # fmt: skip
     if isinstance(recordings, Recording) or not recordings:
         given = "a recording" if isinstance(recordings, Recording) else "none"
         raise ValueError(f"recordings must hold at least one, in a list, got {given}")
@@ -99,332 +157,379 @@ def identify(
     for part in parameters.values():
         instance("parameters", part, Parameter, "of mg.identification, such as mass(scene, 'torso')")
     instance("scene", scene, Scene, "of mg.load_scene")
-    instance("held_out", held_out, Sequence, "a list of recordings")
-    for part in (*recordings, *held_out):
+    for part in recordings:
         instance("recordings", part, Recording, "of mg.identification.Recording")
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
-    max_steps = whole("max_steps", max_steps)
-    function("log", log, "step", "metrics")
     instance("free_start", free_start, bool | None, "True, False or None")
-    if contact is None:
-        has_sensors = any(set(one.measured) - set(STATES) for one in (*recordings, *held_out))
-        contact = Discrete()
-        scene = scene if has_sensors or scene.data.qpos.dtype == np.float64 else scene.with_engine(QUICK)
-    program = _Program(scene, recordings, parameters, free_start=free_start, delay=delay, contact=contact)
-    steps = itertools.count(1)
-    end = _descend(program, program.start(), steps, max_steps, log)
-    has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
-    if end.stopped is Stopped.INTERRUPTED:
-        return _identified(program, end, None, held_out, has_noise)
-    many, noise = None, 1.0 if has_noise else None
-    try:
-        is_rugged = _ruggedness(program, end) > _RUGGED
-        if is_rugged or _is_off(program, end, noise, _DOUBT):
-            many = _ensemble(program, noise, steps, log)
-            end = _alone(program, end, many, steps, max_steps, log)
-            rms = np.linalg.norm(many.residual) / math.sqrt(program.num_numbers)
-            residual, slope, _ = _without_offsets(*on_host(end.found))
-            told = _told(residual, slope * np.asarray(program.coordinates.scale), np.finfo(float).tiny)
-            if _is_off(program, end, many.noise):
-                many = None if not is_rugged and _rms(program, end.found) < _BETTER * rms else many
-            elif told > _told(many.residual, many.slope, many.noise**2):
-                many, end = None, end._replace(stopped=Stopped.CONVERGED)
-    except KeyboardInterrupt:
-        end = end._replace(stopped=Stopped.INTERRUPTED)
-    except DivergedError:  # most motions between the bounds
-        end = end._replace(stopped=Stopped.STALLED)
-    end = end._replace(num_steps=next(steps) - 1)
-    return _identified(program, end, many, held_out, has_noise)
+    return _Problem(Motions(scene, parameters, delay=delay, contact=contact), recordings, free_start)
 
 
-def _ensemble(program: "_Program", noise: float | None, steps: Iterator[int], log: Log) -> Ensemble:
-    def say(rms: float) -> None:
-        step = next(steps)
-        if log is not None:
-            log(step, {"rms": rms, "is_accepted": 1.0})
+class _Problem:
+    """Recordings as windows, and the motions that explain them."""
 
-    windows = after_start(program.windows, program.spread)
-    box = [np.where(np.isfinite(x), x, sign) for x, sign in zip(program.coordinates.box(), (-1.0, 1.0), strict=True)]
-    run = lambda points, draws: program.motions(windows, points, draws * program.spread)  # noqa: E731
-    return fit(run, (box[0], box[1]), program.spread.shape, _num_numbers(windows), noise, say)
+    def __init__(self, motions: Motions, recordings: Sequence[Recording], free_start: bool | None):
+        self.motions, self.free_start = motions, free_start
+        self.spread = spread(motions.scene, recordings, free_start)
+        # One unknown for each noisy number of a start, in units of its noise, or for all of them.
+        sizes = np.ones_like(self.spread) if free_start else self.spread
+        self.free = np.flatnonzero(sizes.any(axis=0))
+        self.sizes = sizes[:, self.free]
+        self.windows = stack(motions.scene, recordings)
+        self.count, self.num_steps = len(motions.coordinates.names), self.windows.controls.shape[1]
+        self.num_numbers = num_numbers(self.windows)
+        if not self.num_numbers:
+            raise ValueError("recordings must hold something that was measured, got NaN alone")
 
+    def offsets(self, starts: Float[np.ndarray, "*points windows free"]) -> Float[np.ndarray, "*points windows both"]:
+        """Return changes of the starts (m, rad, m/s, rad/s)."""
+        found = np.zeros((*starts.shape[:-1], self.spread.shape[1]))
+        found[..., self.free] = starts * self.sizes
+        return found
 
-def _alone(program: "_Program", end: _End, many: Ensemble, steps: Iterator[int], max_steps: int, log: Log) -> _End:
-    """Return the best end of descents from the motions that fit best.
-
-    The sum of squares has many minima, by noisy starts or by chatter. Others' distances, weighed by likelihood, are what the
-    covariance about one of them lacks.
-    """
-    ends, count = [end], len(program.coordinates.names)
-    total = lambda one: float(jnp.sum(one.found[0] ** 2)) / many.noise**2  # noqa: E731
-    for values, starts in many.alone:
-        squares, left = [total(one) for one in ends], max_steps - sum(one.num_steps for one in ends)
-        if left < 1 or sum(one < min(squares) + 1 for one in squares) >= _AGREE:
-            break
-        with contextlib.suppress(DivergedError):
-            ends.append(_descend(program, program.point(values, starts), steps, min(left, _SHORT), log))
-        if ends[-1].stopped is Stopped.INTERRUPTED:
-            raise KeyboardInterrupt
-    _, first = np.unique(np.round([total(one) for one in ends], 1), return_index=True)  # the best one first
-    ends = [ends[i] for i in first]
-    values = np.stack([np.asarray(program.coordinates.values(one.point[:count]), float) for one in ends])
-    weights = scipy.special.softmax([-total(one) / 2 for one in ends])
-    away = values - values[0]
-    return ends[0]._replace(first=end.first, stopped=end.stopped, away=np.einsum("k,ki,kj->ij", weights, away, away))
+    def residuals(self, points: Sequence[Point], steps: int) -> Float[np.ndarray, "points windows numbers"]:
+        """Return residuals over so many steps, in units of the noise."""
+        values, starts = (np.stack(parts) for parts in zip(*points, strict=True))
+        found = self.motions.coordinates.values(values)
+        return self.motions.residuals(self.windows, found, self.offsets(starts), steps)
 
 
-def _told(residual: np.ndarray, slope: np.ndarray, least: float) -> float:
-    """Return the logarithm of the determinant of the information on the values, by a variance of the noise of this at least."""
-    return float(np.linalg.slogdet(slope.T @ slope / max(np.mean(residual**2), least))[1])
+class _Search:
+    """A search and how far it has come: an interruption finds its best end so far."""
+
+    def __init__(self, problem: _Problem, max_steps: int, log: Log):
+        self.problem, self._most, self._log = problem, max_steps, log
+        self.num_steps, self._begun, self._foretold = 0, time.monotonic(), 0.0
+        self._rounding = float(np.finfo(problem.motions.scene.data.qpos.dtype).eps) ** 0.75
+        self._to_go = 0.0  # of the last descent, standard errors squared
+        self._latest: tuple[Point, np.ndarray] | None = None
+        self._pace = math.inf  # s of a motion of all windows
+        start = Point(np.zeros(problem.count), np.zeros(problem.sizes.shape))
+        for _ in range(2):  # the first call compiles
+            began = time.monotonic()
+            residual = problem.residuals([start] * 2, problem.num_steps)[0]
+            self._pace = (time.monotonic() - began) / 2
+        if not np.isfinite(residual).all():
+            raise DivergedError(
+                "nominal values must give motions that stay finite, got one that diverged: begin elsewhere"
+            )
+        self.first = math.sqrt((residual**2).sum() / problem.num_numbers)
+        nothing = np.zeros((*residual.shape, problem.count)), np.zeros((*residual.shape, problem.sizes.shape[1]))
+        self.end = _End(start, factors_of(residual, *nothing), float((residual**2).sum()), residual)
+
+    def price(self, is_rugged: bool) -> tuple[float, int]:
+        """Return the seconds that a search takes, about, and its motions of all windows."""
+        columns = self.problem.count + self.problem.sizes.shape[1]
+        num = _DESCENT * 2 * columns + is_rugged * _ENSEMBLES * ensemble_size(columns)
+        return num * self._pace, int(num)
+
+    def run(self, has_noise: bool) -> Stopped:
+        """Return why the search ended."""
+        noise = 1.0 if has_noise else None
+        self._foretold = self.price(bool(self.problem.motions.scene.pairs))[0]
+        self._say(self.first)
+        stopped, is_rugged = self._descend(self.end.point, noise)
+        if is_rugged and stopped is not Stopped.STEPS:
+            stopped = self._average(self.noise(noise))
+        if stopped is not Stopped.STEPS and self._is_off(noise):
+            for point in self._scattered(noise):
+                stopped, is_rugged = self._descend(point, noise)
+            if is_rugged and stopped is not Stopped.STEPS:
+                stopped = self._average(self.noise(noise))
+        return stopped
+
+    def noise(self, known: float | None) -> float:
+        """Return the size of the noise: as stated, else what is left, of which some may be chatter."""
+        return known or max(math.sqrt(self.end.squares / self.problem.num_numbers), 1e-12)
+
+    @property
+    def seconds(self) -> float:
+        """Return the seconds since the search began."""
+        return time.monotonic() - self._begun
+
+    def _say(self, rms: float, share: float = 1.0) -> None:
+        if self._log is not None:
+            left = max(self._foretold - self.seconds, 0.0)
+            self._log(self.num_steps, {"rms": rms, "share": share, "seconds": left})
+
+    def keep_latest(self) -> None:
+        """Keep the latest point of a horizon that is still growing, where its whole motion is better."""
+        if self._latest is not None and self.end.many is None:
+            point, factors = self._latest
+            residual = self.problem.residuals([point], self.problem.num_steps)[0]
+            if (total := float((residual**2).sum())) <= self.end.squares:
+                self.end = _End(point, factors, total, residual)
+
+    def _descend(self, point: Point, noise: float | None) -> tuple[Stopped, bool]:
+        """Minimise the residuals from a point over horizons that grow; return why it ended and whether the end is rugged."""
+        problem, widths = self.problem, None
+        needed = 2 * (problem.count + problem.sizes.shape[1])
+        horizons = [max(round(share * problem.num_steps), 1) for share in _HORIZONS]
+        horizons = [*(steps for steps in horizons[:-1] if self._counts(steps) > needed), horizons[-1]]
+        for steps in horizons:
+            stopped, point, linear, widths = self._minimise(point, widths, steps, is_last=False)
+            if stopped is Stopped.STEPS:
+                return stopped, False
+        if self.is_rugged(linear, point, self.noise(noise)):
+            return stopped, True
+        stopped, point, linear, _ = self._minimise(point, widths, horizons[-1], is_last=True)
+        # Beside a jump no step is better, though derivatives foretell one.
+        is_beside = self._to_go > 1.0 and not self._is_exact(math.sqrt(self.end.squares))
+        return stopped, is_beside or self.is_rugged(linear, point, self.noise(noise))
+
+    def _is_exact(self, left: float) -> bool:
+        """Return whether so much is left that differences would be rounding."""
+        return left < _EXACT * self.first * math.sqrt(self.problem.num_numbers)
+
+    def _minimise(
+        self, point: Point, widths: tuple[np.ndarray, np.ndarray] | None, steps: int, is_last: bool
+    ) -> tuple[Stopped, Point, "_Linear", tuple[np.ndarray, np.ndarray]]:
+        """Go down by Levenberg and Marquardt's steps over so many time steps."""
+        problem, is_whole = self.problem, steps == self.problem.num_steps
+        numbers = problem.num_numbers if is_whole else max(int(self._counts(steps)), 1)
+        residual = problem.residuals([point], steps)[0]
+        share = _NARROW / math.sqrt(numbers) if is_last else _WIDE
+        if not np.isfinite(residual).all():
+            raise DivergedError("the best values so far give a motion that diverges")
+        damping, trials, box = _DAMPED[0], 0, problem.motions.coordinates.box()
+        while True:
+            total = float((residual**2).sum())
+            widths = widths or (np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], _FIRST))
+            linear = self.linear(point, residual, widths, steps, share)
+            widths = linear.widths
+            factors = factors_of(residual, linear.slope, linear.by_start)
+            if is_whole and total <= self.end.squares:
+                self.end = _End(point, factors, total, residual)
+            self._latest, self.num_steps = (point, factors), self.num_steps + 1
+            self._say(math.sqrt(total / numbers), steps / problem.num_steps)
+            room = box[0] - point.values, box[1] - point.values
+            if self.num_steps >= self._most:
+                return Stopped.STEPS, point, linear, widths
+            newton = solved(factors, problem.count, room)
+            self._to_go = newton.length * numbers / max(total, 1e-300)
+            is_exact = math.sqrt(total / numbers) < self._rounding * self.first
+            if is_exact or (is_whole and self._to_go < _CLOSE):
+                return Stopped.CONVERGED, point, linear, widths
+            while True:
+                trials += 1
+                step = solved(factors, problem.count, room, damping)
+                longest = np.abs(step.values).max(initial=0.0)
+                shorter = min(1.0, _LONGEST / max(longest, 1e-300))
+                trial = Point(np.clip(point.values + shorter * step.values, *box), point.starts + shorter * step.starts)
+                after = problem.residuals([trial], steps)[0]
+                is_better = bool(np.isfinite(after).all()) and float((after**2).sum()) < total
+                damping *= _EASED if is_better else _RAISED
+                if is_better or damping > _DAMPED[1] or trials >= _TRIALS[is_whole]:
+                    break
+            if not is_better:
+                return Stopped.CONVERGED, point, linear, widths
+            gain, point, residual = total - float((after**2).sum()), trial, after
+            if gain * (numbers if is_last else 1) < (_CLOSE if is_last else _ENOUGH) * total:
+                return Stopped.CONVERGED, point, linear, widths
+
+    def _counts(self, steps: int) -> int:
+        windows = self.problem.windows
+        is_in = (windows.index + windows.share <= steps)[..., None]
+        return sum(int(((weight > 0) & is_in).sum()) for weight in windows.weight.values())
+
+    def linear(
+        self, point: Point, residual: np.ndarray, widths: tuple[np.ndarray, np.ndarray], steps: int, share: float
+    ) -> "_Linear":
+        """Return derivatives by secants, and widths of the next: a share of what is left to explain."""
+        problem, points = self.problem, []
+        for part, sizes in enumerate(widths):
+            for i, width in enumerate(sizes):
+                for sign in (1.0, -1.0):
+                    parts = [point.values.copy(), point.starts.copy()]
+                    parts[part][..., i] += sign * width
+                    points.append(Point(*parts))
+        box = problem.motions.coordinates.box()
+        points = [Point(np.clip(values, *box), starts) for values, starts in points]
+        began = time.monotonic()
+        found = problem.residuals(points, steps) if points else np.zeros((0, *residual.shape))
+        if steps == problem.num_steps and points:
+            self._pace = (time.monotonic() - began) / len(points)
+        is_finite, count = np.isfinite(found).all(axis=(1, 2)), problem.count
+        found[~is_finite] = residual
+        for i in np.flatnonzero(~is_finite):
+            points[i] = point
+        coordinates, columns = problem.motions.coordinates, []
+        rates = coordinates.rates(coordinates.values(point.values))
+        for i in range(0, len(points), 2):
+            (values, starts), (others, begun) = points[i], points[i + 1]
+            if i // 2 < count:  # by the value: residuals are more linear in it than in its logarithm
+                apart = ((coordinates.values(values) - coordinates.values(others)) / rates)[i // 2]
+            else:
+                apart = (starts - begun)[:, i // 2 - count, None]
+            columns.append((found[i] - found[i + 1]) / np.where(apart == 0, np.inf, apart))
+        both = np.stack(columns, axis=-1) if columns else np.zeros((*residual.shape, 0))
+        slope, by_start = both[..., :count], both[..., count:]
+        left = max(float(np.linalg.norm(residual)), 1e-300)
+        felt = np.linalg.norm(slope, axis=(0, 1)), np.linalg.norm(by_start, axis=(0, 1)) / math.sqrt(len(residual))
+        least = math.sqrt(float(np.finfo(problem.motions.scene.data.qpos.dtype).eps)) * 10
+        left_of = left, left / math.sqrt(len(residual))
+        widest = _WIDEST, 1.0 if not problem.free_start else _WIDEST / 2
+        new = tuple(
+            np.clip(share * size / np.where(one > 0, one, 1e-300), least, most)
+            for size, one, most in zip(left_of, felt, widest, strict=True)
+        )
+        return _Linear(slope, by_start, new)
+
+    def is_rugged(self, linear: "_Linear", point: Point, noise: float) -> bool:
+        """Return whether motions some standard errors away are not where derivatives foretell."""
+        problem, rng = self.problem, np.random.default_rng(0)
+        residual = problem.residuals([point], problem.num_steps)[0]
+        if self._is_exact(float(np.linalg.norm(residual))):
+            return False
+        factors = factors_of(residual, linear.slope, linear.by_start)
+        by_start, mixed, slope, _ = split(factors, problem.count)
+        inner, root = np.linalg.pinv(by_start, rcond=1e-6), _AWAY * noise * np.linalg.pinv(slope, rcond=1e-6)
+        box, points = problem.motions.coordinates.box(), []
+        for _ in range(_NUM_AWAY):
+            change = np.clip(root @ rng.normal(size=root.shape[1]), -_WIDEST, _WIDEST)
+            values = np.clip(point.values + change, *box)
+            change = values - point.values
+            starts = np.einsum(
+                "wij,wj->wi", inner, _AWAY * noise * rng.normal(size=point.starts.shape) - mixed[..., :-1] @ change
+            )
+            points.append(Point(values, point.starts + starts))
+        found = problem.residuals(points, problem.num_steps)
+        ratios = []
+        for one, (values, starts) in zip(found, points, strict=True):
+            change = linear.slope @ (values - point.values)
+            change += np.einsum("wns,ws->wn", linear.by_start, starts - point.starts)
+            parted = np.sum((one - residual - change) ** 2) if np.isfinite(one).all() else np.inf
+            ratios.append(parted / max(float(np.sum(change**2)), 1e-300))
+        return bool(np.median(ratios) > _RUGGED) and bool(np.any(linear.slope))
+
+    def _is_off(self, noise: float | None) -> bool:
+        """Return whether more is left than noise has by chance; if that is not known, whether little was explained."""
+        after = math.sqrt(self.end.squares / self.problem.num_numbers)
+        if self.end.many is not None:
+            return after > MISFIT * self.noise(noise)
+        if noise:
+            freedom = self.problem.num_numbers - self.problem.count - self.problem.sizes.size
+            return exceeds_noise(after / noise, freedom)
+        return after > _LEFT * self.first
+
+    def _scattered(self, noise: float | None) -> Iterator[Point]:
+        """Yield the points between the bounds whose motions fit best, most of their course."""
+        problem, rng = self.problem, np.random.default_rng(1)
+        low, high = problem.motions.coordinates.box()
+        low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
+        values = rng.uniform(low, high, (_SCATTERED, problem.count))
+        starts = np.zeros((_SCATTERED, *problem.sizes.shape)) + self.end.point.starts
+        found = problem.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], problem.num_steps)
+        losses = np.log1p((found / (_CORE * (noise or self.first))) ** 2).sum(axis=(1, 2))
+        for i in np.argsort(np.where(np.isfinite(losses), losses, np.inf))[:_BEST]:
+            if np.isfinite(losses[i]):
+                yield Point(values[i], starts[i])
+
+    def _average(self, noise: float) -> Stopped:
+        """Fit the mean of many motions, from the best end, and keep it unless that explains nothing more."""
+        problem, alone = self.problem, self.end
+
+        def say(found: Ensemble) -> None:
+            self.num_steps += 1
+            if found.squares < self.end.squares or self.end.many is not None:
+                point = Point(found.values, found.starts)
+                self.end = _End(point, found.factors, found.squares, None, found)
+            self._say(math.sqrt(found.squares / problem.num_numbers))
+
+        def run(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
+            return problem.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], problem.num_steps)
+
+        by_start, _, slope, _ = split(alone.factors, problem.count)
+        excess = max(math.sqrt(alone.squares / problem.num_numbers), noise)
+        widths = np.hypot(_SPREAD, excess * np.linalg.norm(np.linalg.pinv(slope, rcond=1e-6), axis=1))
+        own = np.linalg.norm(np.linalg.pinv(by_start, rcond=1e-6), axis=2) * 3 * excess
+        own = own if problem.free_start else np.full(problem.sizes.shape, noise)
+        box = problem.motions.coordinates.box()
+        try:
+            found = fit(run, alone.point, (np.minimum(widths, _WIDEST), own), box, noise, problem.num_numbers, say)
+        except DivergedError:
+            return Stopped.STALLED
+        return Stopped.CONVERGED if found.is_settled or self.end.many is None else Stopped.STALLED
 
 
-def _is_off(program: "_Program", end: _End, noise: float | None, chance: float = CHANCE) -> bool:
-    """Return whether a descent left more than noise has by chance; if that is not known, whether it explained little."""
-    after = _rms(program, end.found)
-    if noise:
-        return exceeds_noise(after / noise, program.num_numbers - len(program.start()), chance)
-    return after > _LEFT * end.first
+class _Linear(NamedTuple):
+    """Derivatives by coordinates and by the starts of windows, and widths for the next ones."""
+
+    slope: Float[np.ndarray, "windows numbers dim"]
+    by_start: Float[np.ndarray, "windows numbers free"]
+    widths: Any
 
 
-def _identified(
-    program: "_Program", end: _End, many: Ensemble | None, held_out: Sequence[Recording], has_noise: bool
-) -> Identification:
-    """Return the values at the end of a search, or of an ensemble, with all that the recordings tell of them."""
-    coordinates, numbers = program.coordinates, program.num_numbers
-    count, stopped = len(coordinates.names), end.stopped
-    if many is None:
-        point, (residual, slope, num_offsets) = end.point[:count], _without_offsets(*on_host(end.found))
-        signals = np.asarray(end.found[0], float)
-    else:
-        point, signals, residual, num_offsets = jnp.asarray(many.point), many.residual, many.residual, 0
-        slope = many.slope / np.asarray(coordinates.scale, float)
-        if stopped is not Stopped.INTERRUPTED:
-            stopped = Stopped.CONVERGED if many.is_settled else Stopped.STALLED
-    values = np.asarray(coordinates.values(point.astype(coordinates.nominal.dtype)), float)
-    signals = signals.reshape(*program.windows.index.shape, -1)
-    verdict = statistics(coordinates, values, residual, slope, numbers, num_offsets, end.away)
+def num_numbers(windows: Windows) -> int:
+    """Return the number of measured numbers."""
+    return sum(int((weight > 0).sum()) for weight in windows.weight.values())
+
+
+def _slope(problem: _Problem, factors: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the derivative by the values, orthogonal to the effect of the starts."""
+    return split(factors, problem.count)[2] / problem.motions.coordinates.rates(values)
+
+
+def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording], has_noise: bool) -> Identification:
+    """Return the values at the end of a search with all that the recordings tell of them."""
+    problem, end = search.problem, search.end
+    coordinates, numbers = problem.motions.coordinates, problem.num_numbers
+    values = coordinates.values(end.point.values)
+    slope = _slope(problem, end.factors, values)
+    verdict = statistics(coordinates, values, end.squares, slope, numbers, problem.sizes.size)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
-    nominal = np.asarray(coordinates.nominal, float)
-    is_at_bound = coordinates.is_at_bound(jnp.asarray(values, coordinates.nominal.dtype))
+    signals = np.zeros((1, 2, 1)) if end.residual is None else end.residual.reshape(*problem.windows.index.shape, -1)
+    motions = problem.motions
     return Identification(
         **verdict,
         values=coordinates.unravel(values),
-        start=coordinates.unravel(nominal),
+        start=coordinates.unravel(coordinates.nominal),
         names=coordinates.names,
-        at_bounds=tuple(name for name, at in zip(coordinates.names, is_at_bound, strict=True) if at),
-        rms=(end.first, float(np.linalg.norm(residual) / np.sqrt(numbers))),
+        at_bounds=tuple(np.array(coordinates.names)[coordinates.is_at_bound(values)].tolist()),
+        rms=(search.first, math.sqrt(end.squares / numbers)),
         has_noise=has_noise,
-        held_out_rms=None if stopped is Stopped.INTERRUPTED else program.held_out_rms(held_out, end.point, many),
-        offsets=program.offsets(end.point) if many is None else None,
+        held_out_rms=None if stopped is Stopped.INTERRUPTED or not held_out else _held_out(search, held_out, has_noise),
+        offsets=problem.offsets(end.point.starts) if problem.free.size else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
-        num_motions=1 if many is None else len(many.points),
+        num_motions=1 if end.many is None else len(end.many.drawn),
         num_numbers=numbers,
-        num_steps=end.num_steps,
+        num_steps=search.num_steps,
+        seconds=search.seconds,
         stopped=stopped,
-        scene=program.put(program.nominal, jnp.asarray(values, coordinates.nominal.dtype)),
+        scene=motions.put(values),
         coordinates=coordinates,
-        units={name: parameter.unit for name, parameter in program.parameters.items()},
+        units={name: parameter.unit for name, parameter in motions.parameters.items()},
     )
 
 
-def _ruggedness(program: "_Program", end: _End) -> float:
-    """Return how a standard error away the sum of squares grows, over what its derivatives foretell: 1 where it is smooth."""
-    residual, slope = _linear_model(program, end.found)
-    sizes, axes = np.linalg.eigh(slope.T @ slope)
-    is_clear, total = sizes > _CLEAR * sizes.max(), float(residual @ residual)
-    lengths = np.where(is_clear, np.sqrt(total / program.num_numbers / np.where(is_clear, sizes, 1.0)), 0.0)
-    growth = []
-    for draw in np.random.default_rng(0).normal(size=(_NUM_AWAY, len(sizes))):
-        change = axes @ (lengths * draw)
-        there = program(jnp.asarray(end.point + change, end.point.dtype))[0]
-        foretold = np.sum((slope @ change) ** 2) + np.finfo(float).tiny
-        growth.append(abs(float(jnp.sum(there**2)) - total) / foretold)
-    return float(np.median(growth))
-
-
-class _Program:
-    """Residuals and their derivatives by values and offsets. Measurements are arguments, so other data compile nothing."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        recordings: Sequence[Recording],
-        parameters: Mapping[str, Parameter],
-        *,
-        free_start: bool | None,
-        delay: str | None,
-        contact: Contact,
-    ):
-        self.nominal, self.parameters, self.coordinates = scene, parameters, Coordinates.of(parameters)
-        self.free_start, self._delay, self._contact = free_start, delay, contact
-        self.spread = spread(scene, recordings, free_start)
-        # One unknown for each noisy number of a start, in units of its noise, or for all of them.
-        sizes = np.ones_like(self.spread) if free_start else self.spread
-        self._free = np.flatnonzero(sizes.any(axis=0))
-        self._sizes = jnp.asarray(sizes[:, self._free], self.coordinates.nominal.dtype)
-        self.windows = stack(scene, recordings)
-        self.num_numbers = _num_numbers(self.windows)
-        if not self.num_numbers:
-            raise ValueError("recordings must hold something that was measured, got NaN alone")
-        self._compiled: dict[Any, jax.stages.Compiled] = {}
-
-    def _run(self, function: Callable, *arguments: Any) -> Any:
-        key = function, *(leaf.shape for leaf in jax.tree.leaves(arguments))
-        if key not in self._compiled:
-            self._compiled[key] = compile_once(jax.jit(function).lower(*arguments))
-        return self._compiled[key](*arguments)
-
-    def put(self, scene: Scene, vector: Array) -> Scene:
-        return write_all(scene, self.parameters, self.coordinates.unravel(vector))
-
-    def _residuals(self, vector: Array, offset: Array | None, window: Windows) -> Array:
-        scene = self.put(self.nominal, vector)
-        delay = None if self._delay is None else self.coordinates.unravel(vector)[self._delay]
-        residual, diverged = residuals(scene, window, offset, delay, contact=self._contact)
-        return jnp.where(diverged, jnp.inf, residual)
-
-    def _traced(self, windows: Windows, vector: Array, starts: Array, sizes: Array) -> tuple[Array, ...]:
-        def one(window: Windows, start: Array, size: Array) -> tuple[Array, ...]:
-            def both(vector: Array, start: Array) -> tuple[Array, Array]:
-                residual = self._residuals(vector, self._change(start * size), window)
-                return residual, residual
-
-            slopes, residual = jax.jacfwd(both, (0, 1) if start.size else (0,), has_aux=True)(vector, start)
-            return residual, *slopes
-
-        return jax.vmap(one)(windows, starts, sizes)
-
-    def _change(self, free: Array) -> Array | None:
-        """Return the change of a start with these free numbers; None if all starts are known."""
-        return jnp.zeros(self.spread.shape[1], free.dtype).at[self._free].set(free) if free.size else None
-
-    def _over_points(self, windows: Windows, points: Array, starts: Array) -> Array:
-        def of_one(given: tuple[Array, Array]) -> Array:
-            vector = self.coordinates.values(given[0])
-            return jax.vmap(lambda window, start: self._residuals(vector, start, window))(windows, given[1])
-
-        return jax.lax.map(of_one, (points, starts), batch_size=_SIDE_BY_SIDE)
-
-    def motions(self, windows: Windows, points: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Return the residuals of motions by point, window and number, with changes of the starts."""
-        size, dtype, found = min(_MOST_AT_ONCE, len(points)), self.coordinates.nominal.dtype, []
-        for begin in range(0, len(points), size):
-            parts = [x[begin : begin + size] for x in (points, starts)]
-            full = [jnp.asarray(np.pad(x, [(0, size - len(x)), *[(0, 0)] * (x.ndim - 1)]), dtype) for x in parts]
-            found.append(np.asarray(self._run(self._over_points, windows, *full), float)[: len(parts[0])])
-        return np.concatenate(found)
-
-    def __call__(self, point: Array) -> tuple[Array, ...]:
-        vector = self.coordinates.values(point[: len(self.coordinates.names)])
-        return self._run(self._traced, self.windows, vector, self._starts(point), self._sizes)
-
-    def start(self) -> Array:
-        """Return the point of the nominal values, with starts as they were given: zero."""
-        return jnp.zeros(len(self.coordinates.names) + self._sizes.size, self.coordinates.nominal.dtype)
-
-    def point(self, values: np.ndarray, starts: np.ndarray) -> Array:
-        """Return the point of these coordinates, and of changes of the starts in units of their noise."""
-        free = (starts * self.spread)[:, self._free] / np.where(self._sizes > 0, self._sizes, 1.0)
-        return jnp.asarray(np.concatenate([values, free.ravel()]), self.coordinates.nominal.dtype)
-
-    def box(self) -> tuple[Array, Array]:
-        """Return the bounds of a point; starts are unbounded."""
-        free = jnp.full(self._sizes.size, jnp.inf)
-        lower, upper = self.coordinates.box()
-        return jnp.concatenate([lower, -free]), jnp.concatenate([upper, free])
-
-    def _starts(self, point: Array) -> Array:
-        return point[len(self.coordinates.names) :].reshape(self._sizes.shape)
-
-    def offsets(self, point: Array) -> np.ndarray | None:
-        """Return the changes of the starts at a point, one row per window; None if all starts are known."""
-        if not self._sizes.size:
-            return None
-        return np.asarray(jax.vmap(self._change)(self._starts(point) * self._sizes))
-
-    def held_out_rms(
-        self, held_out: Sequence[Recording], point: Array, many: Ensemble | None
-    ) -> tuple[float, float] | None:
-        """Return the rms residuals of held-out recordings at the nominal values and in the end; None without any."""
-        if not held_out:
-            return None
-        noise = spread(self.nominal, held_out, self.free_start)
-        judged, count = after_start(stack(self.nominal, held_out), noise), len(self.coordinates.names)
-        starts, found = np.zeros((2, *noise.shape)), self.offsets(point)
-        if many is None and found is not None:  # the end of a recording has the start that was found for its beginning
-            begins, known = (np.hstack([one.state.qpos, one.state.qvel]) for one in (judged, self.windows))
-            is_same = np.all(begins[:, None] == known, axis=2) & noise.any(axis=1, keepdims=True)
-            starts[1] = np.where(is_same.any(axis=1)[:, None], found[is_same.argmax(axis=1)], 0.0)
-        ends = self.motions(judged, np.stack([np.zeros(count), point[:count]]), starts)
-        if many is not None:
-            draws = many.noise * np.random.default_rng(1).normal(size=(len(many.points), *noise.shape))
-            ends = [ends[0], many.judged(self.motions(judged, many.points, draws * noise))]
-        first, last = (float(np.linalg.norm(one) / np.sqrt(_num_numbers(judged))) for one in ends)
-        return first, last
-
-
-def _rms(program: _Program, found: tuple[Array, ...]) -> float:
-    return math.sqrt(float(jnp.sum(found[0] ** 2)) / program.num_numbers)
-
-
-def _num_numbers(windows: Windows) -> int:
-    return sum(int((np.asarray(weight) > 0).sum()) for weight in windows.weight.values())
-
-
-def _descend(program: _Program, point: Array, steps: Iterator[int], max_steps: int, log: Log) -> _End:
-    """Minimise the residuals from a point, until an interruption at most."""
-    tolerance = float(np.sqrt(jnp.finfo(point.dtype).eps))
-    end = best = _End(point, program(point), 0, Stopped.INTERRUPTED, 0.0)
-    first = _rms(program, best.found)
-    if not np.isfinite(first):
-        raise DivergedError("nominal values must give motions that stay finite, got one that diverged: begin elsewhere")
-    size, triangles = (first or 1.0) * math.sqrt(program.num_numbers), {}
-
-    def triangle(at: np.ndarray) -> np.ndarray:
-        """Return the triangular factor of derivative and residual, which has their products and few rows."""
-        nonlocal end, best
-        if (key := at.tobytes()) not in triangles:
-            triangles.clear()
-            point = jnp.asarray(at, best.point.dtype)
-            found = best.found if not best.num_steps else program(point)
-            end = _End(point, found, end.num_steps + 1, Stopped.INTERRUPTED, first)
-            rms = _rms(program, found)
-            is_better = not best.num_steps or rms < _rms(program, best.found)
-            best = end if is_better else best
-            step = next(steps)
-            if log is not None:
-                log(step, {"rms": rms, "is_accepted": float(is_better)})
-            residual, slope = _linear_model(program, found)
-            is_finite = np.isfinite(residual).all() and np.isfinite(slope).all()
-            factor = np.linalg.qr(np.column_stack([slope, residual]) / size, mode="r") if is_finite else np.inf
-            triangles[key] = np.broadcast_to(factor, (min(len(residual), len(at) + 1), len(at) + 1))
-        return triangles[key]
-
-    of, by = (lambda at: triangle(at)[:, -1]), (lambda at: triangle(at)[:, :-1])
-    settings: dict[str, Any] = {"ftol": _TOO_LITTLE / program.num_numbers, "xtol": tolerance, "gtol": None, "jac": by}
-    bounds = tuple(np.asarray(part, float) for part in program.box())
-    with contextlib.suppress(KeyboardInterrupt):
-        done = scipy.optimize.least_squares(of, np.asarray(point, float), bounds=bounds, max_nfev=max_steps, **settings)
-        best = best._replace(stopped=Stopped.CONVERGED if done.status else Stopped.STEPS)
-    return best._replace(num_steps=end.num_steps)
-
-
-def _linear_model(program: _Program, found: tuple[Array, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals and their derivative by the point."""
-    residual, slope, *by_start = on_host(found)
-    blocks: list[Any] = [scipy.linalg.block_diag(*part) for part in by_start]
-    slope = slope.reshape(residual.size, -1) * np.asarray(program.coordinates.scale, float)
-    return residual.ravel(), np.column_stack([slope, *blocks])
-
-
-def _without_offsets(
-    residual: np.ndarray, slope: np.ndarray, by_offset: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return residuals, their derivative by the values orthogonal to the effect of offsets, and the number of offsets."""
-    parts, count = list(slope), 0
-    for i, of_window in enumerate(() if by_offset is None else by_offset):
-        left, sizes, _ = np.linalg.svd(of_window, full_matrices=False)
-        left = left[:, sizes > 1e-8 * sizes.max(initial=0.0)]
-        parts[i], count = parts[i] - left @ (left.T @ parts[i]), count + left.shape[1]
-    return residual.ravel(), np.concatenate(parts), count
+def _held_out(search: _Search, held_out: Sequence[Recording], has_noise: bool) -> tuple[float, float]:
+    """Return the rms residuals of held-out recordings at the nominal values and in the end."""
+    problem, motions, end = search.problem, search.problem.motions, search.end
+    noise = spread(motions.scene, held_out, problem.free_start)
+    judged = after_start(stack(motions.scene, held_out), noise)
+    starts, count = np.zeros(noise.shape), math.sqrt(num_numbers(judged))
+    begins, known = (np.hstack([np.asarray(w.state.qpos), np.asarray(w.state.qvel)]) for w in (judged, problem.windows))
+    # The end of a recording has the start that was found for its beginning.
+    is_same = np.all(begins[:, None] == known, axis=2) & noise.any(axis=1, keepdims=True)
+    found = np.where(is_same.any(axis=1)[:, None], problem.offsets(end.point.starts)[is_same.argmax(axis=1)], 0.0)
+    values = motions.coordinates.values(np.stack([np.zeros(problem.count), end.point.values]))
+    first, last = motions.residuals(judged, values, np.stack([starts, found]))
+    if end.many is not None:
+        size = search.noise(1.0 if has_noise else None)
+        draws = (
+            size
+            * np.random.default_rng(1).normal(size=(len(end.many.drawn), *noise.shape))
+            * ~is_same.any(axis=1)[:, None]
+        )
+        every = motions.residuals(judged, motions.coordinates.values(end.many.drawn), found + draws * noise)
+        is_finite = np.isfinite(every).all(axis=(1, 2))
+        drawn, free = end.many.drawn[is_finite], draws[is_finite][..., noise.any(axis=0)]
+        if len(drawn) > 2 * (problem.count + free.shape[2]) + 2:
+            factors, _ = Regression(drawn, free, every[is_finite]).weighed(size)
+            # The start as noise and what follows tell it.
+            prior = size * np.pad(np.eye(free.shape[2]), ((0, 0), (0, problem.count + 1)))
+            factors = np.concatenate([factors, np.broadcast_to(prior, (len(factors), *prior.shape))], axis=1)
+            best = np.append(end.point.values - drawn.mean(axis=0), 1.0)
+            by_start, rest = factors[..., : -len(best)], factors[..., -len(best) :] @ best
+            last = rest - np.einsum("wij,wj->wi", by_start @ np.linalg.pinv(by_start), rest)
+    return float(np.linalg.norm(first) / count), float(np.linalg.norm(last) / count)

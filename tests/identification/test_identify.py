@@ -10,7 +10,8 @@ import pytest
 import mjxgrad as mg
 from mjxgrad import identification
 from mjxgrad.identification import Parameter, Recording, Stopped
-from mjxgrad.identification.recording import residuals, stack
+from mjxgrad.identification.motions import Motions
+from mjxgrad.identification.recording import stack
 
 _STEP, _STEPS = 0.01, 40
 _CART = """<mujoco><option timestep="0.01"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
@@ -30,8 +31,9 @@ def cart():
     return mg.load_scene(_CART)
 
 
-def _interrupted(*_, **__):
-    raise KeyboardInterrupt
+def _interrupted(step, _):
+    if step:
+        raise KeyboardInterrupt
 
 
 def _noisy():
@@ -47,18 +49,19 @@ def test_an_interrupted_search_returns_the_best_values_so_far(cart):
     assert result.stopped is Stopped.INTERRUPTED
     assert result.num_steps == 1
     assert np.isfinite(result.half_width["gear"])
-    assert "interrupted: do not trust" in result.headline
+    assert result.headline.startswith("Interrupted, best so far: error")
 
 
 @pytest.mark.parametrize(
     ("error", "stopped"), [(KeyboardInterrupt, Stopped.INTERRUPTED), (mg.DivergedError, Stopped.STALLED)]
 )
-def test_a_second_search_that_fails_keeps_the_first_ones_values(cart, monkeypatch, error, stopped):
-    """Interrupted, or since most motions diverge between the bounds."""
+def test_an_ensemble_that_fails_keeps_the_values_found_before(cart, monkeypatch, error, stopped):
+    """Interrupted, or since most motions diverge."""
 
     def fails(*_):
         raise error
 
+    monkeypatch.setattr("mjxgrad.identification.search._Search.is_rugged", lambda *_: True)
     monkeypatch.setattr("mjxgrad.identification.search.fit", fails)
     result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [_noisy()])
     assert result.stopped is stopped
@@ -78,7 +81,7 @@ def test_values_that_explain_nothing_are_not_called_found(cart, knows_noise):
     result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [noise])
     assert not result.is_sound
     assert result.headline.startswith("Not found, for more than noise is left")
-    assert result.headline.endswith("before.")
+    assert " before; " in result.headline
     assert ("times the noise" in result.headline) == knows_noise
 
 
@@ -169,8 +172,8 @@ def test_starts_and_a_delay_are_found_with_the_parameter(cart):
     np.testing.assert_allclose(result.offsets, starts, atol=1e-6)
 
 
-def test_through_a_bounce_a_descent_stalls_without_an_onset_and_goes_on_from_the_best_of_many_motions():
-    """The height of a drop from the simulation's own course after the impact, to which both come back exactly.
+def test_through_a_bounce_an_onset_gives_the_exact_height_and_the_own_motion_one_within_its_interval():
+    """The height of a drop from the simulation's own course after the impact.
 
     The place then falls where the height grows. Without an onset it is a sawtooth, each tooth of which rises.
     """
@@ -188,15 +191,16 @@ def test_through_a_bounce_a_descent_stalls_without_an_onset_and_goes_on_from_the
         start = mg.initial_state(scene, qvel=jnp.array([-1.0]))
         there = scene.with_model(**raised(scene.model, 0.25))
         course = mg.rollout(there, start, horizon=60, contact=contact).qpos + 0.25
-        measured = np.column_stack([np.zeros((61, 2)), course])
-        recording = Recording({"tip": measured[late]}, times=times[late], start=start)
+        noise = 0.0 if name == "onset" else 1e-5
+        measured = np.column_stack([np.zeros((61, 2)), course]) + noise * np.random.default_rng(0).normal(size=(61, 3))
+        stated = {"tip": noise} if noise else {}
+        recording = Recording({"tip": measured[late]}, times=times[late], start=start, noise=stated)
         found[name] = mg.identify(scene, {"height": Parameter(0.3, 0.1, 0.5, raised)}, [recording], contact=contact)
     assert found["onset"].stopped is Stopped.CONVERGED
     np.testing.assert_allclose(found["onset"].values["height"], 0.25, atol=1e-6)
-    np.testing.assert_allclose(found["discrete"].values["height"], 0.25, atol=1e-12)
-    assert found["onset"].num_motions == found["discrete"].num_motions == 1
-    many = dataclasses.replace(found["discrete"], num_motions=512)
-    assert "the mean of 512 motions is fitted" in many.summary()
+    assert abs(found["discrete"].values["height"] - 0.25) < found["discrete"].half_width["height"] < 0.03
+    assert found["onset"].num_motions == 1 < found["discrete"].num_motions
+    assert "motions is fitted" in found["discrete"].summary()
 
 
 def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_angle():
@@ -217,11 +221,13 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     whole = Recording({"qpos": turned, "qvel": course.qvel}, controls, noise=noise, start=start)
     windows = stack(scene, whole.cut(0.08, 0.01))
     assert windows.controls.shape == (3, 8, 1)
-    evaluate = jax.jit(jax.vmap(lambda w: residuals(scene, w, None, None, contact=mg.Discrete())[0]))
-    found = np.array(evaluate(windows)).reshape(3, 9, 14)[..., :7]
-    assert np.abs(found).max() < 1e-7
-    whole_found = np.array(evaluate(stack(scene, [whole]))[0]).reshape(31, 14)[:, :7]
-    np.testing.assert_allclose(whole_found[25], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
+    # By C MuJoCo and by MJX.
+    for contact in (None, mg.Onset()):
+        motions = Motions(scene, {"none": Parameter(1.0)}, delay=None, contact=contact)
+        found = motions.residuals(windows, np.ones((1, 1)), np.zeros((1, 3, 14))).reshape(3, 9, 14)[..., :7]
+        assert np.abs(found).max() < 1e-7
+        whole_found = motions.residuals(stack(scene, [whole]), np.ones((1, 1)), np.zeros((1, 1, 14))).reshape(31, 14)
+        np.testing.assert_allclose(whole_found[25, :7], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
 
 
 def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):

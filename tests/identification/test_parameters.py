@@ -35,15 +35,27 @@ def scene():
 def test_the_search_begins_at_the_nominal_values_and_stays_within_the_bounds():
     """Between two bounds, above one, below one, without, on one."""
     inf = np.inf
-    rows = [(1.0, 0.5, 4.0), (3.0, 1.0, inf), (-2.0, -inf, 1.0), (0.7, -inf, inf), (0.5, 0.5, 4.5)]
+    rows = [(1.0, -0.5, 3.0), (3.0, 1.0, inf), (-2.0, -inf, 1.0), (0.7, -inf, inf), (-0.5, -0.5, 3.5)]
     coordinates = Coordinates.of({str(i): Parameter(*row) for i, row in enumerate(rows)})
-    values = jax.jit(jax.vmap(coordinates.values))(jnp.linspace(-3, 3, 61)[:, None].repeat(5, axis=1))
-    np.testing.assert_allclose(values[30], [1.0, 3.0, -2.0, 0.7, 0.5])
+    values = coordinates.values(np.linspace(-3, 3, 61)[:, None].repeat(5, axis=1))
+    np.testing.assert_allclose(values[30], [1.0, 3.0, -2.0, 0.7, -0.5])
     np.testing.assert_allclose(values[31] - values[30], 0.1 * np.array([3.5, 2.0, 3.0, 0.7, 4.0]))
-    np.testing.assert_allclose(values[0], [0.5, 1.0, -11.0, -1.4, 0.5])
-    np.testing.assert_allclose(values[60], [4.0, 9.0, 1.0, 2.8, 4.5])
+    np.testing.assert_allclose(values[0], [-0.5, 1.0, -11.0, -1.4, -0.5])
+    np.testing.assert_allclose(values[60], [3.0, 9.0, 1.0, 2.8, 3.5])
     np.testing.assert_array_equal(coordinates.is_at_bound(values[0]), [True, True, False, False, True])
     np.testing.assert_array_equal(coordinates.is_at_bound(values[60]), [True, False, True, False, True])
+
+
+def test_numbers_of_one_sign_are_searched_by_their_logarithm():
+    """The bounds are ends of the box, and the derivative is that of the exponential."""
+    coordinates = Coordinates.of({"a": Parameter(2.0, 0.2, 20.0), "b": Parameter(-0.2, -0.3, -0.1)})
+    low, high = coordinates.box()
+    np.testing.assert_allclose([low, high], [[-np.log(10), -np.log(2)], [np.log(10), np.log(1.5)]])
+    at = np.array([0.3, -0.2])
+    found = coordinates.values(at)
+    np.testing.assert_allclose(found, [2 * np.exp(0.3), -0.2 * np.exp(-0.2)])
+    slope = (coordinates.values(at + 1e-6) - coordinates.values(at - 1e-6)) / 2e-6
+    np.testing.assert_allclose(coordinates.rates(found), slope, rtol=1e-8)
 
 
 def test_makers_write_what_they_say(scene):

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mjxgrad.identification.normal import factors_of, solved, split
 from mjxgrad.identification.parameters import Coordinates, Parameter
 from mjxgrad.identification.result import statistics
-from mjxgrad.identification.search import _without_offsets
 
 
 def _coordinates(**nominal):
@@ -16,7 +16,7 @@ def _coordinates(**nominal):
 
 def _judge(slope, residual, **nominal):
     values = np.array(list(nominal.values()), float)
-    return SimpleNamespace(**statistics(_coordinates(**nominal), values, residual, slope, len(residual), 0))
+    return SimpleNamespace(**statistics(_coordinates(**nominal), values, residual @ residual, slope, len(residual), 0))
 
 
 def test_intervals_cover_as_often_as_they_say():
@@ -67,8 +67,27 @@ def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():
     whole = np.column_stack(
         [shared.reshape(27, 2), np.kron(np.eye(3), np.ones((9, 2))) * np.tile(offsets.reshape(27, 2), 3)]
     )
-    flat, slope, count = _without_offsets(residual, shared, offsets)
-    found = statistics(_coordinates(a=1.0, b=1.0), np.ones(2), flat, slope, 27, count)
-    expected = (residual**2).sum() / (27 - 8) * np.linalg.inv(whole.T @ whole)[:2, :2]
-    assert count == 6
+    *_, slope, flat = split(factors_of(residual, shared, offsets), 2)
+    best, *_ = np.linalg.lstsq(whole, -residual.ravel(), rcond=None)
+    left = residual.ravel() + whole @ best
+    found = statistics(_coordinates(a=1.0, b=1.0), np.ones(2), left @ left, slope, 27, 6)
+    expected = (left**2).sum() / (27 - 8) * np.linalg.inv(whole.T @ whole)[:2, :2]
     np.testing.assert_allclose(found["covariance"], expected, rtol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(flat + slope @ best[:2]), np.linalg.norm(left), rtol=1e-10)
+
+
+def test_the_step_is_that_of_one_regression_of_all_and_stops_at_a_bound():
+    """Two windows with an own offset each; where the best slope is beyond a bound, the others are the best beside it."""
+    rng = np.random.default_rng(1)
+    shared, offsets, residual = rng.normal(size=(2, 9, 2)), rng.normal(size=(2, 9, 1)), rng.normal(size=(2, 9))
+    whole = np.zeros((18, 4))
+    whole[:, :2], whole[:9, 2], whole[9:, 3] = shared.reshape(18, 2), offsets[0, :, 0], offsets[1, :, 0]
+    best, *_ = np.linalg.lstsq(whole, -residual.ravel(), rcond=None)
+    step = solved(factors_of(residual, shared, offsets), 2)
+    np.testing.assert_allclose(np.append(step.values, step.starts), best, rtol=1e-9)
+    half = best[0] / 2
+    room = np.full(2, -9.0), np.full(2, 9.0)
+    room[int(half > 0)][0] = half
+    step = solved(factors_of(residual, shared, offsets), 2, room)
+    others, *_ = np.linalg.lstsq(whole[:, 1:], -residual.ravel() - half * whole[:, 0], rcond=None)
+    np.testing.assert_allclose(np.concatenate([step.values, step.starts.ravel()]), [half, *others], rtol=1e-6)
