@@ -16,7 +16,7 @@ from mjxgrad._programs import compile_once
 from mjxgrad._warnings import collected
 from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.engines import QUICK, engine_of
-from mjxgrad.engines.layout import EVERY, MOTION, USER
+from mjxgrad.engines.layout import MOTION, USER
 from mjxgrad.engines.pool import pool_of
 from mjxgrad.identification.parameters import Coordinates, Parameter, write_all
 from mjxgrad.identification.recording import STATES, Windows

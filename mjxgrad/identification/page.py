@@ -27,7 +27,7 @@ def identified_page(
     numbers = Block(faults=result.warnings(), items=[told] * (result.condition_number > 100), table=Table(head, rows))
     # The held-out end of a single recording, else the first recording.
     motions = [recordings[0], *(held_out[:1] if len(recordings) == 1 else ())]
-    blocks = [_figures(scene, result, motions), numbers, Block(folded="In words", code=result.summary())]
+    blocks = [numbers, _figures(scene, result, motions), Block(folded="In words", code=result.summary())]
     return page(result.headline, f"mjxgrad identify {name}", blocks)
 
 
@@ -57,7 +57,8 @@ def _figures(scene: Scene, result: Identification, motions: Sequence[Recording])
     least = sorted(one[0] for one in signals)[-_MOST_SIGNALS:][0]
     panel = functools.partial(_panel, float(scene.model.opt.timestep), fitted_until)
     drawings = [svg(functools.partial(panel, *one[1:]), f"{one[1]} over time") for one in signals if one[0] >= least]
-    caption = "SI units. Dots: measured. Dashed: where the search began. Line: with the values found. Grey: held out."
+    caption = "SI units. Dots: measured. Dashed: where the search began. Line: with the values found."
+    caption += " Grey: held out." * (fitted_until is not None)
     if (count := result.num_motions) > 1:
         caption += f" Contacts chatter: one motion, as this line, parts from the dots; the mean of {count} fits."
     if len(signals) > len(drawings):

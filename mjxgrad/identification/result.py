@@ -209,7 +209,7 @@ class Identification(Printed):
     __str__ = summary
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return the values as a table of text, header first: name and unit, value, interval, start, bounds, what goes with it."""
+        """Return the values as a table of text, header first: name, value, interval, start, bounds, and what it goes with."""
         parts = (self.values, self.half_width, self.start)
         columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
         told = {"covariance": self.covariance, "inseparable": self.inseparable}

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._arrays import function, instance, whole
-from mjxgrad.identification.ensemble import MISFIT, Ensemble, Regression, fit, size as ensemble_size
+from mjxgrad.identification.ensemble import MISFIT, Ensemble, fit
+from mjxgrad.identification.ensemble import size as ensemble_size
 from mjxgrad.identification.motions import Motions
 from mjxgrad.identification.normal import factors_of, solved, split
 from mjxgrad.identification.parameters import Parameter
@@ -488,7 +489,7 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
         at_bounds=tuple(np.array(coordinates.names)[coordinates.is_at_bound(values)].tolist()),
         rms=(search.first, math.sqrt(end.squares / numbers)),
         has_noise=has_noise,
-        held_out_rms=None if stopped is Stopped.INTERRUPTED or not held_out else _held_out(search, held_out, has_noise),
+        held_out_rms=None if stopped is Stopped.INTERRUPTED or not held_out else _held_out(search, held_out),
         offsets=problem.offsets(end.point.starts) if problem.free.size else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
         num_motions=1 if end.many is None else len(end.many.drawn),
@@ -502,7 +503,7 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
     )
 
 
-def _held_out(search: _Search, held_out: Sequence[Recording], has_noise: bool) -> tuple[float, float]:
+def _held_out(search: _Search, held_out: Sequence[Recording]) -> tuple[float, float]:
     """Return the rms residuals of held-out recordings at the nominal values and in the end."""
     problem, motions, end = search.problem, search.problem.motions, search.end
     noise = spread(motions.scene, held_out, problem.free_start)
@@ -514,22 +515,4 @@ def _held_out(search: _Search, held_out: Sequence[Recording], has_noise: bool) -
     found = np.where(is_same.any(axis=1)[:, None], problem.offsets(end.point.starts)[is_same.argmax(axis=1)], 0.0)
     values = motions.coordinates.values(np.stack([np.zeros(problem.count), end.point.values]))
     first, last = motions.residuals(judged, values, np.stack([starts, found]))
-    if end.many is not None:
-        size = search.noise(1.0 if has_noise else None)
-        draws = (
-            size
-            * np.random.default_rng(1).normal(size=(len(end.many.drawn), *noise.shape))
-            * ~is_same.any(axis=1)[:, None]
-        )
-        every = motions.residuals(judged, motions.coordinates.values(end.many.drawn), found + draws * noise)
-        is_finite = np.isfinite(every).all(axis=(1, 2))
-        drawn, free = end.many.drawn[is_finite], draws[is_finite][..., noise.any(axis=0)]
-        if len(drawn) > 2 * (problem.count + free.shape[2]) + 2:
-            factors, _ = Regression(drawn, free, every[is_finite]).weighed(size)
-            # The start as noise and what follows tell it.
-            prior = size * np.pad(np.eye(free.shape[2]), ((0, 0), (0, problem.count + 1)))
-            factors = np.concatenate([factors, np.broadcast_to(prior, (len(factors), *prior.shape))], axis=1)
-            best = np.append(end.point.values - drawn.mean(axis=0), 1.0)
-            by_start, rest = factors[..., : -len(best)], factors[..., -len(best) :] @ best
-            last = rest - np.einsum("wij,wj->wi", by_start @ np.linalg.pinv(by_start), rest)
     return float(np.linalg.norm(first) / count), float(np.linalg.norm(last) / count)
