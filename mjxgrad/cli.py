@@ -280,7 +280,7 @@ def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) ->
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     program = importlib.import_module("mjxgrad.checking.check").program
     write(output, program(verdict, str(Path(scene)), str(output.with_suffix(".mp4"))))
-    print(f"wrote {output}: write your cost into it, then python {output}")
+    print(f"{verdict.headline}\nwrote {output}: write your cost into it, then python {output}")
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")
 

@@ -27,6 +27,7 @@ _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the la
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _OFF = 0.25  # expected error of a derivative from which it is a fault
+_ENOUGH = 32  # motions
 _CLEAR = 0.1  # largest relative error of a usable slope
 _DISAGREES = 0.1  # relative difference beyond which the slopes at two time steps disagree
 
@@ -217,8 +218,8 @@ def price_finding(prices: Mapping[str, float], found: Sequence[Slope], horizon: 
 
 
 def _is_far(found: Sequence[Slope]) -> bool:
-    """Return whether each kind of derivative is far from the slope."""
-    return all(one.error > _OFF for one in found)
+    """Return whether each kind of derivative is far from the slope, by motions enough to tell that from scatter."""
+    return all(one.error > _OFF and one.num_motions >= _ENOUGH for one in found)
 
 
 def _time_step_findings(measured: Measured) -> Iterator[Finding]:

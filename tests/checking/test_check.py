@@ -147,13 +147,13 @@ def test_pairs_are_counted_as_they_are_listed():
 
 
 def test_what_a_budget_leaves_no_time_for_is_named():
-    """Nothing is begun after a thousandth of a second."""
+    """Nothing is begun after a thousandth of a second but a line by eight motions, so that there is a verdict."""
     verdict = mg.check(ball(), budget=1e-3)
-    assert "an unmeasured choice; " in verdict.headline
+    assert re.search("% off by [1-9][0-9]* readings; ", verdict.headline)
     assert verdict.recommendation.estimator == "alpha_order"  # is never wrong
-    (told,) = [one.text for one in verdict.findings if one.kind == "not_measured"]
-    assert "0.001 s" in told
-    assert not kinds(verdict)
+    assert "readings by 8 motions each" in verdict.summary().replace("\n  ", " ")
+    (told,) = [one.text for one in verdict.findings if one.kind == "left_out"]
+    assert "budget of 0.001 s: noise of 0.1; a line along the controls;" in told
     assert len(verdict.headline.split()) <= 25
 
 
