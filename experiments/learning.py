@@ -315,7 +315,8 @@ def _how(settings: Settings, method: Method, environment: Environment) -> learni
         count = max(2, count // settings.num_branches)
         weight = 9.81 * float(environment.scene.model.body_mass.sum())
         changes["bundle"] = learning.Bundle(settings.num_branches, force=_LOADED * weight)
-    return (apg if settings.algorithm == "apg" else learning.Settings)(
+    wide = learning.Settings.for_gpu if count >= 1024 else learning.Settings
+    return (apg if settings.algorithm == "apg" else wide)(
         num_environments=count,
         window=settings.window,
         critic_rate=settings.critic_rate,

@@ -3,6 +3,7 @@
 import contextlib
 import inspect
 import operator
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -50,17 +51,41 @@ def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> 
     return found is not None and bool(np.all((found if column is None else found[..., column]) == number))
 
 
-def whole(name: str, value: Any, least: int | None = 1) -> int:
-    """Return a count; refuse fractions, counts that are too small, and traced values."""
+def whole(name: str, value: Any, least: int | None = 1, most: int = 2**31 - 1) -> int:
+    """Return a count; refuse fractions, True, counts that are too small or too large, and traced values."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(f"{name} must be known before anything is compiled, got a traced value; make it static")
     try:
         number = operator.index(value)
-    except TypeError:
+        assert not isinstance(value, bool | np.bool)
+    except (TypeError, AssertionError):
         raise ValueError(f"{name} must be a whole number, got {value!r}") from None
     if least is not None and number < least:
         raise ValueError(f"{name} must be at least {least}, got {number}")
+    if number > most:
+        raise ValueError(f"{name} must be at most {most}, got {number}")
     return number
+
+
+def sizes(name: str, value: Any, example: str) -> tuple[int, ...]:
+    """Return counts; refuse anything but a tuple or list of them."""
+    instance(name, value, tuple | list, f"a tuple of whole numbers, such as {example}")
+    return tuple(whole(f"{name}[{i}]", one) for i, one in enumerate(value))
+
+
+def within(name: str, value: Any, low: int | float, high: int | float, wanted: str) -> None:
+    """Refuse all but one number between two others; a bound of 0 that is `low` with an infinite `high` is excluded."""
+    found = np.asarray(real(name, value))
+    is_open = low == 0 and high == np.inf
+    if found.ndim or not (low < found < high if is_open else low <= found <= high):
+        raise ValueError(f"{name} must be {wanted}, got {value}")
+
+
+def one_of(name: str, value: Any, choices: Iterable[Any], remedy: str = "") -> None:
+    """Refuse what is none of the choices."""
+    choices = tuple(choices)
+    if not any(value is one or (isinstance(value, str) and value == one) for one in choices):
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}{remedy}")
 
 
 def instance(name: str, value: Any, kind: Any, wanted: str) -> None:
@@ -69,11 +94,11 @@ def instance(name: str, value: Any, kind: Any, wanted: str) -> None:
         raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
 
 
-def function(name: str, value: Any, *arguments: str) -> None:
-    """Refuse what is neither a function of these arguments nor None."""
+def function(name: str, value: Any, *arguments: str, is_needed: bool = False) -> None:
+    """Refuse what is neither a function of these arguments nor, unless one is needed, None."""
     try:
-        if value is not None:
-            inspect.signature(value).bind(*arguments)
+        if value is not None or is_needed:
+            inspect.signature(value).bind(*arguments)  # pyright: ignore[reportArgumentType]
     except TypeError as error:
         wanted = f"{name} must be a function of {' and '.join(arguments)}"
         raise ValueError(f"{wanted}, got {type(value).__name__}: {error}") from None

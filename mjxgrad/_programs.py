@@ -6,16 +6,27 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+import sys
+import sysconfig
+import threading
+import types
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjxgrad._warnings import STOPPED
 
 _Function = TypeVar("_Function", bound=Callable)
+_INSTALLED = (*(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")), str(Path(__file__).parent))
+_ATOMS = (type(None), bool, int, float, complex, str, bytes, np.dtype, np.generic, type(...), slice)
 
 
 def is_traced(arguments: Any) -> bool:
@@ -23,40 +34,193 @@ def is_traced(arguments: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
 
 
+class Form:
+    """A tree without its arrays; called with arrays it is the tree again. It equals itself alone."""
+
+    def __init__(self, static: Any, structure: Any):
+        self.static, self.structure = static, structure
+
+    def __call__(self, leaves: Sequence[Any]) -> Any:
+        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
+
+
+_FORMS: collections.OrderedDict[Any, Form] = collections.OrderedDict()
+_MOST_KEPT = 64
+
+
+def parted(tree: Any, *, trusts_hash: bool = False) -> tuple[list[jax.Array], Form]:
+    """Return the arrays of a tree, and its form, the same one for all trees of equal content beside arrays.
+
+    A function defined anew, as in a Python loop, has equal content if its code and all that it refers to are equal. What may
+    change unseen, such as a set, has a new form each time, or one form by its hash.
+    """
+    arrays, static = eqx.partition(tree, eqx.is_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    form = Form(static, structure)
+    try:
+        key = _content(static, {})
+    except _UnknownError:
+        key = (structure, *jax.tree.leaves(static)) if trusts_hash else form
+    try:
+        form = _FORMS.setdefault(key, form)
+    except TypeError:  # no hash
+        return leaves, form
+    if len(_FORMS) > _MOST_KEPT:
+        _FORMS.popitem(last=False)
+    return leaves, form
+
+
+class _UnknownError(Exception):
+    """Something may change without a trace."""
+
+
+class _Same:
+    """Something that is equal to itself alone."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, _Same) and other.value is self.value
+
+
+def _content(value: Any, seen: dict[int, tuple[int, Any]]) -> Any:
+    """Return a key that is equal for equal content; what was seen is named by its number, also within itself."""
+    if isinstance(value, _ATOMS):
+        return type(value), repr(value)
+    if id(value) in seen:
+        return "seen", seen[id(value)][0]
+    seen[id(value)] = len(seen), value
+    of = lambda *parts: tuple(_content(part, seen) for part in parts)  # noqa: E731
+    if isinstance(value, np.ndarray | jax.Array):
+        return _digest(value)
+    if isinstance(value, mujoco.MjModel):
+        content = np.empty(mujoco.mj_sizeModel(value), np.uint8)
+        mujoco.mj_saveModel(value, None, content)
+        return _digest(content)
+    is_made_once = "<locals>" not in getattr(value, "__qualname__", "")
+    if isinstance(value, types.ModuleType | type | types.FunctionType) and is_made_once and _is_installed(value):
+        return _Same(value)
+    if isinstance(value, types.FunctionType):
+        outside = {} if _is_installed(value) else _outside(value.__globals__, _names(value.__code__), [])
+        try:
+            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        except ValueError:
+            raise _UnknownError from None
+        return value.__code__, *of(value.__defaults__, value.__kwdefaults__, cells, outside)
+    if isinstance(value, types.MethodType):
+        return of(value.__func__, value.__self__)
+    if isinstance(value, functools.partial):
+        return type(value), *of(value.func, value.args, value.keywords)
+    if isinstance(value, tuple | list):
+        return type(value), *of(*value)
+    if isinstance(value, dict | types.MappingProxyType):
+        return type(value), *of(*value, *value.values())
+    if isinstance(value, type):  # the user's, with the functions of its methods and properties
+        members = [
+            x for k, x in vars(value).items() if not k.startswith(("__", "_abc")) or k in ("__call__", "__init__")
+        ]
+        inner = [getattr(x, "method", getattr(x, "fget", getattr(x, "__func__", x))) for x in members]
+        return _Same(value), *of(value.__bases__, inner)
+    if hasattr(value, "__wrapped__"):  # a compiled function
+        return _Same(value), *(() if _is_installed(value) else of(value.__wrapped__))
+    if state := getattr(value, "__dict__", None):
+        return of(type(value), state)
+    if isinstance(value, np.ufunc) or isinstance(getattr(value, "__self__", None), types.ModuleType):
+        return _Same(value)
+    if type(value).__hash__ in (None, object.__hash__):
+        raise _UnknownError
+    return type(value), value
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """Return the names that a function and those within it take from elsewhere."""
+    return set(code.co_names).union(*(_names(part) for part in code.co_consts if isinstance(part, types.CodeType)))
+
+
+def _outside(space: Mapping[str, Any], names: set[str], within: list[Any]) -> dict[str, Any]:
+    """Return what names mean in a module, and in modules of the user that they name there."""
+    found = {name: space[name] for name in names if name in space and not any(space[name] is one for one in within)}
+    for name, value in found.items():
+        if isinstance(value, types.ModuleType) and not _is_installed(value):
+            found[name] = _outside(vars(value), names, [*within, value])
+    return found
+
+
+def _digest(value: Any) -> tuple:
+    if isinstance(value, jax.core.Tracer):
+        raise _UnknownError
+    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        return "key", str(value.dtype), *_digest(jax.random.key_data(value))
+    if value.dtype == object:
+        raise _UnknownError
+    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).digest()
+    return str(value.dtype), value.shape, getattr(value, "weak_type", None), content
+
+
+def _is_installed(value: Any) -> bool:
+    """Return whether something is of an installed library, which does not change while a program runs."""
+    name = value.__name__ if isinstance(value, types.ModuleType) else value.__module__
+    path = getattr(sys.modules.get(name), "__file__", None) or ""
+    return name in sys.builtin_module_names or path.startswith(_INSTALLED)
+
+
 def compiled(function: _Function) -> _Function:
-    """Compile a function of arrays, or trees with arrays, once per shape and structure.
+    """Compile a function of arrays, or trees with arrays, once per shape and content of all else; see `parted`.
 
     Called with traced values it becomes part of the outer program, where more values may be known. The function must depend
-    on its arguments alone: other variables are read only once. Where an argument cannot be told from others, since it has no
-    hash, each call is on its own.
+    on its arguments alone.
     """
-    program = eqx.filter_jit(function)
+
+    @eqx.filter_jit
+    def program(form: Form, leaves: list[jax.Array]) -> Any:
+        args, kwargs = form(leaves)
+        return function(*args, **kwargs)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         # A setting may come as a number of numpy's; only a known one can decide a shape.
         is_count = lambda x: eqx.is_array(x) and x.ndim == 0 and jnp.issubdtype(x.dtype, jnp.integer)  # noqa: E731
         kwargs = {k: int(x) if is_count(x) and not is_traced(x) else x for k, x in kwargs.items()}
-        if is_traced((args, kwargs)) or not _is_hashable((args, kwargs)):
+        if is_traced((args, kwargs)):
             return function(*args, **kwargs)
+        leaves, form = parted((args, kwargs), trusts_hash=True)
         # Weak types belong to a program's signature: feeding results back would compile it a second time.
-        strong = lambda x: x.astype(x.dtype) if getattr(x, "weak_type", False) else x  # noqa: E731
-        return program(*jax.tree.map(strong, args), **jax.tree.map(strong, kwargs))
+        return program(form, [x.astype(x.dtype) if getattr(x, "weak_type", False) else x for x in leaves])
 
     return call  # pyright: ignore[reportReturnType]
 
 
-def _is_hashable(arguments: Any) -> bool:
-    leaves, structure = jax.tree.flatten(arguments)
+def patiently(call: Callable[[], Any]) -> Any:
+    """Return what a call returns, in another thread, so that Ctrl-C ends the wait while a program of C++ runs on.
+
+    The call has most of a second to end; Python functions that it calls give up at once.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    found: Future[Any] = Future()
+
+    def work() -> None:
+        try:
+            found.set_result(call())
+        except BaseException as error:
+            found.set_exception(error)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
     try:
-        hash((structure, tuple(leaf for leaf in leaves if not eqx.is_array(leaf))))
-    except TypeError:
-        return False
-    return True
+        return found.result()
+    except KeyboardInterrupt:
+        STOPPED.set()
+        thread.join(0.7)
+        STOPPED.clear()
+        raise
 
 
 _KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()
-_MOST_KEPT = 64
 
 
 def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> jax.stages.Compiled:

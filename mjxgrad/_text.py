@@ -58,13 +58,23 @@ def format_number(x: float) -> str:
     return f"{x + 0.0:.3g}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
 
 
+def duration(seconds: int | float) -> str:
+    """Return a time in words, to two digits."""
+    for size, unit in ((3600, "h"), (60, "min"), (1, "s")):
+        if seconds >= 1.5 * size or unit == "s":
+            return f"{float(f'{seconds / size:.2g}'):g} {unit}"
+    return ""
+
+
 def write(path: str | Path, content: str | bytes) -> None:
     """Write a file beside its place and rename it, so that a full disk or an interruption leaves what was there.
+
+    Where the path is a symbolic link, its target is written.
 
     Raises:
         OSError: if the file cannot be written; the message names it.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     try:
         with partial.open("wb") as file:

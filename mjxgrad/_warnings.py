@@ -1,4 +1,4 @@
-"""C MuJoCo's warnings, which it would write to the terminal and to a file in the current folder.
+"""C MuJoCo's warnings, which it would write to the terminal and to a file in the current folder; and Ctrl-C while it works.
 
 It has one handler for all threads. A thread that took the handler away while another steps would let that one call nothing.
 """
@@ -10,9 +10,17 @@ from collections.abc import Iterator
 
 import mujoco
 
+STOPPED = threading.Event()
+"""Set for a moment after Ctrl-C: what a program calls back should give up."""
 _LOCK = threading.Lock()
 _LISTENERS: list[tuple[int, deque[str]]] = []  # each with its thread
 _FORMER: list = []  # the handler of whoever came before
+
+
+def give_up_if_stopped() -> None:
+    """Raise a KeyboardInterrupt where Ctrl-C has ended what waits for this; work in pieces asks between them."""
+    if STOPPED.is_set():
+        raise KeyboardInterrupt
 
 
 @contextlib.contextmanager

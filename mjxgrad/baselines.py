@@ -114,7 +114,7 @@ def cross_entropy(
         elite = at[jnp.argsort(costs)[:num_elite]]
         return elite.mean(axis=0), elite.std(axis=0)
 
-    method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples, least_finite=num_elite)
+    method = Population(RunOptions.of(num_steps, options), objective, width, move, num_samples, least_finite=num_elite)
     return run(method, **method.begun(params, key))
 
 

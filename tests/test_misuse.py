@@ -108,6 +108,17 @@ def identify(measured=five, recordings=None, **how):
 cart = envs.load("diffrl_cartpole")
 
 
+class Rewarded(envs.Environment):
+    terms: dict = eqx.field(static=True, default=None)
+    seen: float = None
+
+    def observe(self, state, memory):
+        return state.qpos if self.seen is None else self.seen
+
+    def rewards(self, before, action, after, memory):
+        return self.terms or {"a": 1.0}
+
+
 def elite_policy():
     policy, zero = mg.linear_policy(2, 1)
     noisy = mg.closed_loop(mg.SceneTask(scene, state, len, 2), policy, 0.3, params=zero)
@@ -163,7 +174,7 @@ FOUND = {
     "roll(jnp.zeros((4, 1)), noise=jnp.zeros((3, 1)))": "must agree on the number of steps, got controls 4",
     "roll()": "horizon must be given",
     "roll(lambda p, s: jnp.array(1.0), horizon=2)": "must return one control per actuator, shape (1,), got",
-    "scene.with_engine('warp')": 'engine must be "mjx" or "mujoco", got',
+    "scene.with_engine('warp')": "engine must be one of 'mjx', 'mujoco', got 'warp'",
     "roll(horizon=2, inputs={'ctrl': jnp.zeros((2, 2))})": "inputs must be among qfrc_applied",
     "roll(horizon=2, inputs={'qfrc_applied': jnp.zeros(3)})": "inputs['qfrc_applied'] must have shape (2, 1), one row per step",
     "mg.initial_state(scene, qpos=jnp.zeros(3))": "qpos must have shape (1,) in this scene, got (3,)",
@@ -181,6 +192,53 @@ FOUND = {
     "own_motion('event')": "gradient must be one of 'discrete', 'slope', got 'event'",
     "mg.contact_force(balls.model, balls.data, 'floor', 'bal')": "no geom 'bal'; named geoms are 'floor', 'lamp', 'ball'",
     "mg.contact_force(balls.model, balls.data, 'floor', 'lamp')": "can never touch",
+    # What would take all memory, or counts that are none.
+    "roll(horizon=10**12)": "horizon must be at most 2147483647, got 1000000000000",
+    "roll(horizon=True)": "horizon must be a whole number, got True",
+    "jax.jit(jax.vmap(lambda z: roll(jnp.full((10**5, 1), z))))(jnp.zeros(10**6))":
+        "1000000 rollouts of 100000 steps would take",
+    "first(count=10**12)": "num_samples must be at most 2147483647",
+    "optimise(num_steps=10**12)": "num_steps must be at most 2147483647",
+    "learn(settings=mg.learning.Settings(num_environments=2**31 - 4))": "2147483644 environments would take",
+    "mg.render.frames(scene, np.zeros((3, 1)), speed=1e-9)": "frames would take",
+    "mg.render.frames(scene, np.zeros((3, 1)), speed=jnp.inf)": "speed must be positive, got inf",
+    "mg.render.frames(scene, np.zeros((3, 1)), fps='30')": "fps must be real numbers, got str",
+    "mg.render.frames(scene, 'rest')": "qpos must be real numbers, got str",
+    "mg.render.write_video('x.gif', np.zeros((3, 8, 8, 3)))": "path must be of a file that ends in .mp4, got x.gif",
+    "mg.over_devices(3)": "function must be a function of arrays, got int",
+    "mg.over_devices(len, num_shared='a')": "num_shared must be a whole number, got 'a'",
+    # Tasks, environments and policies.
+    "mg.SceneTask(state, scene, len, 2)": "scene must be of mg.load_scene, got State",
+    "mg.SceneTask(scene, None, len, 2)": "state must be of mg.initial_state",
+    "mg.SceneTask(scene, state, None, 2)": "cost must be a function of trajectory, got NoneType",
+    "mg.SceneTask(scene, state, len, 2, policy_sees='x')": "policy_sees must be one of 'state', 'observations', got 'x'",
+    "roll(jnp.zeros((2, 1)), measure_growth='yes')": "measure_growth must be True or False, got str",
+    "roll(jnp.zeros((2, 1)), inputs=[1.0])": "inputs must be a dict of arrays by name, got list",
+    "mg.linear_policy(4, 1, observe=3)": "observe must be a function of state, got int",
+    "mg.parameter_noise(jnp.sum, 0.1, dim=2.0)": "dim must be a whole number, got 2.0",
+    "mg.parameter_noise(jnp.sum, jnp.inf)": "stddev must be positive and finite, got inf",
+    "mg.load_scene('<mujoco/>', engine='brax')": "engine must be one of 'mjx', 'mujoco', None, got 'brax'",
+    "mg.load_scene('<mujoco/>', keep_everything='no')": "keep_everything must be True or False, got str",
+    "optimise(estimator=None)": "estimator must be a function of objective and params and key, got NoneType",
+    "optimise(evaluate=lambda x: x)": "evaluate must return a scalar of shape (), got shape (2,)",
+    "optimise(bogus=3)": "an option must be one of 'evaluate', 'evaluate_every'",
+    "optimise(checkpoint='.')": "checkpoint must be the path of a file, got the folder '.'; add a name",
+    "optimise(progress='bar')": "progress must be True or False, got str",
+    "estimators.alpha_order(noisy, params, key, num_samples=4, memory=3)": "memory must be the memory of an estimate, got int",
+    "mg.learning.Settings(actor_layers='32')": "actor_layers must be a tuple of whole numbers, such as (64, 64), got str",
+    "mg.learning.Settings(actor_layers=(3.5,))": "actor_layers[0] must be a whole number, got 3.5",
+    "mg.learning.Settings(actor_rate=jnp.inf)": "actor_rate must be positive, got inf",
+    "mg.learning.Settings(actor_decay=-1)": "actor_decay must be positive, got -1",
+    "mg.learning.Settings(has_critic='no')": "has_critic must be True or False, got str",
+    "mg.learning.evaluate(cart, None, key, num_episodes=2)": "policy must be a function of obs, got NoneType",
+    "mg.learning.evaluate('ant', len, key, num_episodes=2)": "environment must be of mg.envs.Environment, got str",
+    "mg.learning.evaluate(cart, len, key, num_episodes=2, engine='warp')": "engine must be one of 'mjx', 'mujoco', got 'warp'",
+    "mg.learning.Policy.load(archive)": "path must be of a policy that save wrote, got",
+    "cart.step(state, jnp.zeros(1))": "state must be of reset or step, got State",
+    "Rewarded(scene, terms={'a': 'b'}).reset(key)": "'a' in rewards of Rewarded must return one number, got str",
+    "Rewarded(scene, seen=3.0).reset(key)": "observe of Rewarded must return a vector, got shape ()",
+    "Rewarded(state)": "scene must be of mg.load_scene, got State",
+    "Rewarded(scene, randomisation=3)": "randomisation must be a function of key and scene, got int",
     # Softness.
     "mg.Softness(damping_ratio=-1)": "damping_ratio must be at least 0",
     "mg.Softness(impedance=1.5)": "impedance must be between 0 and 1",
@@ -202,8 +260,8 @@ FOUND = {
     "jax.vmap(balls.with_softness)(mg.Softness(stiffness=[1e2, 1e3], damping_ratio=[1, 1])).summary()":
         "one scene with known values",
     "mg.load_scene('<mujoco><worldbody><geom size=\".1\"/></worldbody></mujoco>')": "got none (nv = 0)",
-    "scene.with_model(dof_dampng=jnp.ones(1))": "numbers of the MJX model, got dof_dampng; did you mean dof_damping",
-    "scene.with_model(geom_type=jnp.ones(1))": "must name arrays of numbers of the MJX model, got geom_type",
+    "scene.with_model(dof_dampng=jnp.ones(1))": "numbers of the model, got dof_dampng; did you mean dof_damping",
+    "scene.with_model(geom_type=jnp.ones(1))": "must name arrays of numbers of the model, got geom_type",
     "scene.with_model(dof_damping=5.0)": "dof_damping must have shape (1,) in this scene, got ()",
     "scene.with_model(body_mass=jnp.array([0.0, -1]))": "body_mass must not be negative, got -1",
     "scene.with_model(timestep=0.0)": "timestep must be positive, got 0",
@@ -217,7 +275,7 @@ FOUND = {
     "zeroth(num_samples=8, baseline='mean')": "baseline must be one of 'leave_one_out', 'zero_noise', 'none', got 'mean'",
     "first(objective=mg.parameter_noise(jnp.sum, 0.1, dim=1))": "params must have shape (1,), got (2,)",
     "first(at={'force': 1})": "params must have floating-point arrays",
-    "mg.parameter_noise(jnp.sum, 0.0)": "stddev must be positive, got",
+    "mg.parameter_noise(jnp.sum, 0.0)": "stddev must be positive and finite, got 0.0",
     "mg.parameter_noise(jnp.sum, jnp.array([0.1, 0.2]), dim=3)": "stddev must be one number or 3, got shape (2,)",
     "noisy.sample_noise(key)": "dim is not known: pass dim",
     "mg.open_loop(mg.SceneTask(scene, state, len, 4), jnp.ones(3))": "stddev must broadcast to (horizon, nu) = (4, 1), got (3,)",
@@ -264,7 +322,7 @@ FOUND = {
     "fit.Recording({'qpos': np.zeros(2)}, times=[1, 0])": "times of the recording must increase",
     "fit.Recording({'qpos': five}, noise={'qpso': 1})": "noise of the recording must name measured signals",
     "fit.Recording({'qpos': five}, noise={'qpos': 0.0})": "noise of qpos of the recording must be positive",
-    "fit.Recording({'sensor': five}).cut(0.1, 0.01)": "must have measured qpos and qvel to be cut",
+    "fit.Recording({'sensor': five}).cut(0.1, 0.01)": "must have measured qpos to be cut",
     "fit.Recording({'qpos': np.zeros(3)}, wrong)": "4 rows for 3 controls, one at each state",
     "stack(scene, [fit.Recording({'qpos': five}, wrong, 0.01 * np.arange(5))])": "controls of the recording must have a row",
     "stack(scene, [fit.Recording({'qpos': five}, np.zeros((4, 2)))])": "must have 1 columns in this scene",
@@ -358,7 +416,7 @@ FOUND = {
     "mg.render.frames(scene, jnp.zeros((2, 1)), width=64.5)": "width must be a whole number, got 64.5",
     "learn(num_updates='3')": "num_updates must be a whole number, got '3'",
     "mg.learning.Settings(num_environments=8.0)": "num_environments must be a whole number, got 8.0",
-    "mg.learning.Settings(actor_layers=64)": "actor_layers must be a tuple of hidden sizes, such as (64, 64), got int",
+    "mg.learning.Settings(actor_layers=64)": "actor_layers must be a tuple of whole numbers, such as (64, 64), got int",
     # Numbers of another type: text, lists that are ragged, integers, None, objects.
     "roll([[0.0], [0.0, 1.0]])": "controls must be real numbers, got list",
     "mg.initial_state(scene, qvel=data)": "qvel must be real numbers, got MjData",
@@ -388,7 +446,7 @@ FOUND = {
     "roll(u, inputs={'qfrc_applied': jnp.full((2, 1), jnp.nan)})": "inputs['qfrc_applied'] must be finite, got nan",
     "scene.with_model(body_mass=jnp.array([0.0, jnp.inf]))": "body_mass must hold numbers, got infinity",
     "scene.with_model(geom_friction=jnp.array([[-1.0, 0, 0]]))": "geom_friction must not be negative, got -1",
-    "fit.Recording({})": "measured and times of the recording must have the same number of rows, got set()",
+    "fit.Recording({})": "must hold at least one row of some signal, got none",
     "fit.Recording({'qpos': five}, times=[0, 1, 2, 3, np.nan])": "times of the recording must be finite",
     "fit.Recording({'qpos': five}, np.full((4, 1), np.nan))": "controls of the recording must be finite",
     "measured(softness=[1e3, 1e4])": "got lengths [()]; give arrays, not lists",

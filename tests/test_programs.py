@@ -3,6 +3,11 @@
 import os
 import textwrap
 
+import jax.numpy as jnp
+import optax
+import pytest
+
+from mjxgrad._programs import parted
 from tests.processes import run_python
 
 _KEPT = """
@@ -41,3 +46,27 @@ def test_programs_are_kept_for_the_next_process(tmp_path, monkeypatch):
     assert said.count("UserWarning") == said.count(f"programs in {folder} cannot be read") == 1
     (tmp_path / "file").touch()
     assert _run_keeping(tmp_path / "file") == ("None", "0", "")
+
+
+WIDTH, LIST = 1.0, [1.0]
+
+
+def test_functions_of_equal_content_share_a_program():
+    """Made anew they are alike; another number, of a closure, of this module, in a list or an object, makes another."""
+    scaled = lambda factor: lambda x: factor * x  # noqa: E731
+    wide, listed = (lambda x: WIDTH * x), (lambda x: LIST[0] * x)
+    is_same = lambda one, other: parted(one)[1] is parted(other)[1]  # noqa: E731
+    assert is_same(scaled(1.0), scaled(1.0))
+    assert not is_same(scaled(1.0), scaled(2.0))
+    assert not is_same(scaled(1.0), scaled(1))
+    assert is_same(scaled(jnp.ones(3)), scaled(jnp.ones(3)))
+    assert not is_same(scaled(jnp.ones(3)), scaled(jnp.zeros(3)))
+    assert is_same(optax.adam(1e-2), optax.adam(1e-2))
+    assert not is_same(optax.adam(1e-2), optax.adam(1e-3))
+    for function, change in ((wide, {"WIDTH": 2.0}), (listed, {"LIST": [2.0]})):
+        before = parted(function)[1]
+        assert parted(function)[1] is before
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in change.items():
+                patch.setitem(globals(), name, value)
+            assert parted(function)[1] is not before

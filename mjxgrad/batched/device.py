@@ -9,6 +9,8 @@ the cores work in parallel by `over_devices`, and so do several GPUs.
 """
 
 import functools
+import math
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import mlir
+
+from mjxgrad._arrays import whole
 
 
 def is_cpu() -> bool:
@@ -38,6 +42,22 @@ def all_devices() -> list[jax.Device]:
 def own_device() -> jax.Device:
     """Return the first device of this process; each process has devices of its own."""
     return jax.local_devices()[0]
+
+
+def fits(what: str, size: int | float, remedy: str, *, is_on_host: bool = False) -> None:
+    """Refuse what takes more bytes than its device has, before they are asked for; a size is a lower bound."""
+    there = None if is_on_host else (own_device().memory_stats() or {}).get("bytes_limit")
+    there = there or (os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf)
+    if size > there:
+        raise ValueError(f"{what} would take {size / 2**30:.3g} GiB, and there are {there / 2**30:.3g}: {remedy}")
+
+
+def copies(value: Any) -> int:
+    """Return how many of a traced value `jax.vmap` makes; 1 for others."""
+    most, inner = np.size(value), value  # the same, or what `jax.vmap` hides in it
+    while isinstance(inner, jax.core.Tracer):
+        most, inner = max(most, np.size(inner)), getattr(inner, "val", 0)
+    return max(1, most // max(1, np.size(value)))
 
 
 def by_platform(*args: Any, gpu: Callable[..., Any], default: Callable[..., Any]) -> Any:
@@ -74,16 +94,19 @@ def over_devices(function: Callable[..., Any], *, num_shared: int = 0) -> Callab
     Raises:
         ValueError: when called with arguments without a common leading axis, or with one that the devices do not divide.
     """
+    if not callable(function):
+        raise ValueError(f"function must be a function of arrays, got {type(function).__name__}")
+    num_shared = whole("num_shared", num_shared, 0)
 
     @functools.wraps(function)
     def wrapped(*args: Any) -> Any:
         batched = jax.vmap(function, in_axes=tuple(None if i < num_shared else 0 for i in range(len(args))))
         own = all_devices()
-        if len(own) == 1:
-            return batched(*args)
         sizes = {np.shape(x)[:1] for x in jax.tree.leaves(args[num_shared:])}
         if len(sizes) != 1 or sizes == {()}:
             raise ValueError("all arguments that are not shared must have the batch as leading axis, of one size")
+        if len(own) == 1:
+            return batched(*args)
         ((size,),) = sizes
         if size % len(own):
             raise ValueError(f"the batch must be a multiple of the {len(own)} devices, got {size}")

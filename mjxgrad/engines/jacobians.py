@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mjxgrad._warnings import give_up_if_stopped
 from mjxgrad.engines import inverse
 from mjxgrad.engines.events import HAIR, Events, Near, Surfaces, clearance, undecided
 from mjxgrad.engines.flight import Begun
@@ -126,6 +127,7 @@ class Worker:
         for model, group in itertools.groupby(index, key=lambda i: id(steps.models[i])):
             self._use(steps.models[(rows := list(group))[0]], steps.speeds[model], steps.gradient)
             for begin in range(0, len(rows), _TOGETHER):
+                give_up_if_stopped()
                 self._together(steps, rows[begin : begin + _TOGETHER])
 
     def _use(self, given: mujoco.MjModel, speeds: np.ndarray, gradient: str) -> None:

@@ -23,6 +23,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjxgrad._warnings import give_up_if_stopped
+
 # Packages as they are without what they import, which is JAX.
 _START = """
 import sys, types
@@ -105,6 +107,7 @@ class Processes:
 
             def work(child: int) -> None:
                 for piece in pieces:
+                    give_up_if_stopped()
                     self._ask(child, key, model, (path, shapes, piece, arguments(piece)))
 
             list(self.threads.map(work, range(len(self.children))))

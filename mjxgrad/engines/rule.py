@@ -20,6 +20,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from mjxgrad._warnings import give_up_if_stopped
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.engines.flight import NUM_SLOTS
 from mjxgrad.engines.jacobians import with_pairs
@@ -212,6 +213,7 @@ def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *argument
 
 def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
     def run(*given) -> dict[str, np.ndarray]:
+        give_up_if_stopped()
         given = jax.tree.map(np.asarray, given)
         return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
 

@@ -5,6 +5,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
+from mjxgrad._warnings import give_up_if_stopped
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
 
 START = ("time", *MOTION)
@@ -33,6 +34,7 @@ class Stepper:
         self, rows: Float[np.ndarray, "rows size"], models: list[mujoco.MjModel]
     ) -> Float[np.ndarray, "rows size"]:
         """Return whole states after a step of each: the motion, where the rest is as it was."""
+        give_up_if_stopped()
         ends, places = rows.copy(), self.layout.places
         if len(rows) <= _FEW:
             for model, end in zip(models, ends, strict=True):

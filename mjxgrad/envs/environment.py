@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import instance, one_key, real, whole
+from mjxgrad._arrays import function, instance, one_key, real, whole
 from mjxgrad.engines import engine_of
 from mjxgrad.engines.engine import Observe
+from mjxgrad.objective.base import as_scalar
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
@@ -87,6 +88,7 @@ class Environment(InScene):
     def __check_init__(self):
         for name in ("frame_skip", "episode_length"):
             whole(name, getattr(self, name))
+        function("randomisation", self.randomisation, "key", "scene")
 
     @abstractmethod
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
@@ -163,11 +165,20 @@ class Environment(InScene):
         one_key(key)
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
+        name = type(self).__name__
+        instance(f"start of {name}", physics, State, "of mg.initial_state")
         physics = self.completed(physics)
-        obs = self.observe(physics, memory)
+        obs = real(f"observe of {name}", self.observe(physics, memory))
+        if obs.ndim != 1:
+            raise ValueError(f"observe of {name} must return a vector, got shape {obs.shape}")
         action = jnp.zeros(self.num_actions, obs.dtype)
-        terms = jax.eval_shape(lambda: self.rewards(physics, action, physics, memory))
-        instance(f"rewards of {type(self).__name__}", terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
+
+        def rewards() -> Rewards:
+            terms = self.rewards(physics, action, physics, memory)
+            instance(f"rewards of {name}", terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
+            return {term: as_scalar(value, f"{term!r} in rewards of {name}") for term, value in terms.items()}
+
+        terms = jax.eval_shape(rewards)
         zero, no = jnp.zeros((), obs.dtype), jnp.array(False)
         metrics = dict.fromkeys([*terms, "diverged"], zero)
         counter, hidden = jnp.zeros((), jnp.int32), self.privileged(physics, memory)
@@ -184,6 +195,7 @@ class Environment(InScene):
             ValueError: if the action does not have one number per actuator.
         """
         action = real("action", action)
+        instance("state", state, EnvState, "of reset or step")
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import instance
 from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble, is_nothing_felt
 from mjxgrad.estimators.evidence import Evidence, Memory, noise_dim
@@ -56,6 +57,7 @@ def alpha_order(
     parts = stream(objective, vector, key, plan, functools.partial(both_parts, control_variate=control_variate))
     evidence = parts.evidence()
     known = Memory.of(parts.difference.mean, evidence)
+    instance("memory", memory, Memory | None, "the memory of an estimate")
     if memory is not None:
         known = memory.with_more(known)
         evidence = evidence.with_memory(known)

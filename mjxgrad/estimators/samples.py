@@ -46,8 +46,7 @@ class Plan:
     def __post_init__(self):
         pairs = " with antithetic pairs" if self.antithetic else " where pairs share a random start"
         smallest, pairs = (4, pairs) if self.rollouts_per_unit == 2 else (2, "")
-        whole("num_samples", self.num_samples, least=None)
-        if self.num_samples < smallest:
+        if whole("num_samples", self.num_samples, None) < smallest:
             raise ValueError(f"num_samples must be at least {smallest}{pairs}, got {self.num_samples}")
         if self.num_samples % self.rollouts_per_unit:
             raise ValueError(f"num_samples must be even{pairs}, got {self.num_samples}")

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import one_key, whole
+from mjxgrad._arrays import function, instance, one_key, one_of, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.engines import ENGINES, QUICK
 from mjxgrad.envs import Environment, EnvState
@@ -53,6 +53,9 @@ def evaluate(
     Raises:
         ValueError: if there are no episodes, or no such engine.
     """
+    instance("environment", environment, Environment, "of mg.envs.Environment")
+    function("policy", policy, "obs", is_needed=True)
+    one_of("engine", engine, ENGINES)
     num_episodes = whole("num_episodes", num_episodes)
     one_key(key)
     judge = environment if ENGINES[engine].compiles else environment.with_contact(Discrete()).with_engine(engine)

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float, Key, UInt32
 
 from mjxgrad._arrays import instance, whole
 from mjxgrad._text import Printed, format_range
+from mjxgrad.batched.device import fits
 from mjxgrad.envs import Environment
 from mjxgrad.learning.learner import ActorCritic, Learner, Policy
 from mjxgrad.learning.settings import Settings
@@ -66,8 +67,9 @@ def learn(
     log: Log | None = None,
     log_every: int = 10,
     checkpoint: str | Path | None = None,
+    progress: bool = True,
 ) -> Learned:
-    """Learn a policy.
+    """Learn a policy; Ctrl-C returns what was learnt in the updates done.
 
     The history has one number per update for each of these names:
 
@@ -92,9 +94,10 @@ def learn(
         settings: settings of the learner; None takes the defaults.
         log: function called after every `log_every` updates with their means, such as
             `lambda update, metrics: wandb.log(metrics, step=update)`.
-        log_every: updates in one program; logs and checkpoints come between programs.
+        log_every: updates between two logs or checkpoints.
         checkpoint: file to resume from if it exists, written after every `log_every` updates. Settings, key and environment
             (numbers and code) must be the same. The result is that of an uninterrupted run to the bit, except for `seconds`.
+        progress: whether a run of more than ten seconds tells on stderr what it will take, and how far it is.
 
     Raises:
         ValueError: if a number is below 1, environments differ in more than numbers, or the checkpoint is from another run.
@@ -114,22 +117,18 @@ def learn(
     shape, over = key.shape, [None] * key.ndim
     if not isinstance(environment, Environment):
         shape, over = (len(environments), *shape), [axes, *over]
-    progress = run(
-        method,
-        jnp.broadcast_to(key, shape),
-        num_steps=num_updates,
-        segment=log_every,
-        over=over,
-        log=log,
-        checkpoint=checkpoint,
-        on_all_devices=True,
-    )
-    seconds = np.broadcast_to(progress.seconds.reshape(-1, *(1 for _ in shape)), (len(progress.seconds), *shape))
-    if progress.found["skipped"][-log_every:].all():
+    each = settings.window * (environments[0].num_actions + environments[0].scene.model.nv)
+    remedy = "fewer num_environments, or a shorter window"
+    fits(f"{settings.num_environments} environments", 4.0 * settings.num_environments * each, remedy)
+    where = {"log": log, "checkpoint": checkpoint, "progress": progress, "what": ("learn", "update")}
+    how = {"num_steps": num_updates, "segment": log_every, "over": over, "on_all_devices": True, **where}
+    done = run(method, jnp.broadcast_to(key, shape), **how)
+    seconds = np.broadcast_to(done.seconds.reshape(-1, *(1 for _ in shape)), (len(done.seconds), *shape))
+    if done.found["skipped"][-log_every:].all():
         warnings.warn(
             f"nothing was learnt: no gradient of the last {log_every} updates was finite, and their mean reward is "
-            f"{progress.found['reward'][-1].mean():.3g}; look for roots and divisions in rewards and observe",
+            f"{done.found['reward'][-1].mean():.3g}; look for roots and divisions in rewards and observe",
             stacklevel=2,
         )
-    history = {name: jnp.asarray(values) for name, values in (progress.found | {"seconds": seconds}).items()}
-    return Learned(progress.carry.policy, history, progress.carry)
+    history = {name: jnp.asarray(values) for name, values in (done.found | {"seconds": seconds}).items()}
+    return Learned(done.carry.policy, history, done.carry)

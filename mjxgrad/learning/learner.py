@@ -4,15 +4,20 @@ Another learner is another file like this one: a carry with everything that an u
 """
 
 import dataclasses
+import io
 import math
+import zipfile
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
+from mjxgrad._text import write
 from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.learning.mixing import Halves, Products
@@ -41,6 +46,51 @@ class Policy(eqx.Module):
     def __call__(self, obs: Float[Array, " obs"]) -> Float[Array, " nu"]:
         """Return the action, from −1 to 1, without noise."""
         return jnp.tanh(self.actor(self.normaliser(obs)))
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """All its numbers by name: a layer is `gain * normalised(elu(weight @ x + bias)) + offset`, the last `weight @ x + bias`.
+
+        The input is (obs − `mean`) / `scale`; `squares` over `count` is the variance that `scale` comes from.
+        """
+        layers, norms, seen = self.actor.layers, self.actor.norms, self.normaliser
+        return {
+            **{f"{k}{i}": getattr(layer, k) for i, layer in enumerate(layers) for k in ("weight", "bias")},
+            **{
+                f"{k}{i}": getattr(n, of)
+                for i, n in enumerate(norms)
+                for k, of in (("gain", "weight"), ("offset", "bias"))
+            },
+            **{name: getattr(seen, name) for name in ("count", "mean", "squares", "scale")},
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write the `arrays` as an archive of NumPy's, an .npz, from which ten lines of NumPy run the policy; see the how-to."""
+        if self.normaliser.count.ndim:
+            raise ValueError(
+                "policy must be one, got several side by side: jax.tree.map(lambda x: x[0], policy) is the first"
+            )
+        content = io.BytesIO()
+        np.savez(content, allow_pickle=False, **{name: np.asarray(x) for name, x in self.arrays.items()})
+        write(path, content.getvalue())
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Policy":
+        """Return the policy that `save` wrote.
+
+        Raises:
+            ValueError: if the file holds no policy.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                found = {name: jnp.asarray(archive[name]) for name in archive.files}
+            weights = [found[f"weight{i}"] for i in range(sum(name.startswith("weight") for name in found))]
+            sizes = [weights[0].shape[1], *(len(weight) for weight in weights)]
+            blank = cls(Network.make(sizes, jax.random.key(0)), Normaliser.make(sizes[0]))
+            numbers = [found[name] for name in blank.arrays if name != "scale"]  # in the order of the leaves
+            return jax.tree.unflatten(jax.tree.structure(blank), numbers)
+        except (ValueError, KeyError, IndexError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            raise ValueError(f"path must be of a policy that save wrote, got {path}") from error
 
 
 class Learner(eqx.Module):
@@ -161,6 +211,9 @@ class ActorCritic(Method):
     def identity(self) -> dict[str, Any]:
         name = type(self.environment).__qualname__
         return {"settings": repr(self.settings), "environment": name}
+
+    def learnt(self, carry: Learner) -> Policy:
+        return carry.policy
 
     def shared(self) -> Environment:
         return self.environment

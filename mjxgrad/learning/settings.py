@@ -1,12 +1,11 @@
 """Settings for learning from short windows."""
 
 import dataclasses
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from mjxgrad._arrays import instance, real, whole
-from mjxgrad.batched.device import is_gpu
+from mjxgrad._arrays import instance, real, sizes, whole, within
 from mjxgrad.learning.bundle import Bundle
 
 
@@ -15,7 +14,7 @@ class Settings:
     """The settings of a learner; the defaults taught ants and hoppers, with 64 environments as with 1024.
 
     Attributes:
-        num_environments: number of environments side by side: 64, or 1024 on a GPU, which takes little longer for them.
+        num_environments: number of environments side by side; a GPU takes little longer for 1024, see `for_gpu`.
         window: steps of each environment per update.
         discount: discount per step.
         trace: λ of the returns that the policy climbs, see `window`: 1 differentiates through the whole window (SHAC), 0 through
@@ -23,9 +22,9 @@ class Settings:
         alpha: weight of first order, from 0 to 1: 1 is SHAC, 0 has no derivatives. None takes that of the least error in each
             update, see `mixing`: α-order.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
-        actor_layers: hidden sizes of the policy: 128, 64, 32, or twice as many on a GPU, where hoppers then fall less.
+        actor_layers: hidden sizes of the policy.
         actor_scale: factor of the initial gains of the policy's hidden layers.
-        critic_layers: hidden sizes of the value function: 64, 64, or twice as many on a GPU.
+        critic_layers: hidden sizes of the value function.
         actor_rate: learning rate of the policy, which decreases linearly to zero.
         actor_decay: factor of the policy's rate per update, in place of the linear decrease; None for the latter.
         critic_rate: learning rate of the value function, which decreases linearly to zero.
@@ -39,17 +38,15 @@ class Settings:
         bundle: branches over which derivatives are averaged where contact pushes hard; None takes them as they are.
     """
 
-    num_environments: int = dataclasses.field(default_factory=lambda: 1024 if is_gpu() else 64)
+    num_environments: int = 64
     window: int = 16
     discount: float = 0.99
     trace: float = 0.9
     alpha: float | None = None
     stddev: tuple[float, float] = (0.4, 0.25)
-    actor_layers: tuple[int, ...] = dataclasses.field(
-        default_factory=lambda: (256, 128, 64) if is_gpu() else (128, 64, 32)
-    )
+    actor_layers: tuple[int, ...] = (128, 64, 32)
     actor_scale: float = 1.0
-    critic_layers: tuple[int, ...] = dataclasses.field(default_factory=lambda: (128, 128) if is_gpu() else (64, 64))
+    critic_layers: tuple[int, ...] = (64, 64)
     actor_rate: float = 1e-3
     actor_decay: float | None = None
     critic_rate: float = 5e-4
@@ -62,18 +59,19 @@ class Settings:
     def __post_init__(self):
         for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
             whole(name, getattr(self, name))
-        for name in ("actor_scale", "actor_rate", "critic_rate", "largest_sample"):
-            if not np.asarray(real(name, getattr(self, name))) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.bundle is not None:
-            instance("bundle", self.bundle, Bundle, "of mg.learning.Bundle")
-        for name in ("actor_layers", "critic_layers"):
-            instance(name, getattr(self, name), Sequence, "a tuple of hidden sizes, such as (64, 64)")
+        has_decay, has_alpha = self.actor_decay is not None, self.alpha is not None
+        for name in ("actor_scale", "actor_rate", "critic_rate", *(["actor_decay"] if has_decay else [])):
+            within(name, getattr(self, name), 0, np.inf, "positive")
+        if self.largest_sample != np.inf:  # which shortens none
+            within("largest_sample", self.largest_sample, 0, np.inf, "positive")
+        instance("bundle", self.bundle, Bundle | None, "of mg.learning.Bundle")
+        instance("has_critic", self.has_critic, bool, "True or False")
+        for name in ("actor_layers", "critic_layers"):  # a list has no hash
+            object.__setattr__(self, name, sizes(name, getattr(self, name), "(64, 64)"))
         if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
             raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
-        for name in ("discount", "trace", *(["alpha"] if self.alpha is not None else [])):
-            if not 0 <= np.asarray(real(name, getattr(self, name))) <= 1:
-                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)}")
+        for name in ("discount", "trace", *(["alpha"] if has_alpha else [])):
+            within(name, getattr(self, name), 0, 1, "from 0 to 1")
         if self.trace < 1 and not self.has_critic:
             raise ValueError(
                 f"trace must be 1 without a value function, got {self.trace}: there is nothing to blend with"
@@ -83,3 +81,9 @@ class Settings:
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
                 f"got {self.critic_batches}"
             )
+
+    @classmethod
+    def for_gpu(cls, **changes: Any) -> "Settings":
+        """Return settings with 1024 environments and networks twice as wide, by which hoppers fall less, and other changes."""
+        given = {"num_environments": 1024, "actor_layers": (256, 128, 64), "critic_layers": (128, 128)}
+        return cls(**given | changes)

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, whole
-from mjxgrad._programs import compile_once, is_traced
+from mjxgrad._arrays import function, one_of, whole
+from mjxgrad._programs import Form, is_traced, parted
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
 from mjxgrad.loop.run import Log, Method, Progress, mean
-from mjxgrad.objective.base import Scalar, Vector, check_vector
+from mjxgrad.objective.base import Scalar, Vector, as_scalar, check_vector
 
 # Progress is shown every five per cent; each time costs one return from the device.
 NUM_SEGMENTS = 20
@@ -41,8 +41,9 @@ class RunOptions(eqx.Module):
             the run gives up. If such steps do not move the parameters either, three in a row are enough.
         log: function called after every twentieth of the steps: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
             The metrics are the fields of `History` at the last step, the mean over the seeds that took it, and `best_cost`.
-        checkpoint: file to save the run in, as often, and to resume it from. On the same device a resumed run gives the
-            result of an uninterrupted one to the bit, except for the seconds.
+        checkpoint: file to save the run in, as often, and to resume it from, also with more steps. On the same device a
+            resumed run gives the result of an uninterrupted one to the bit, except for the seconds.
+        progress: whether a run of more than ten seconds tells on stderr what it will take, and how far it is.
     """
 
     num_steps: int = eqx.field(converter=functools.partial(whole, "num_steps"))
@@ -51,9 +52,17 @@ class RunOptions(eqx.Module):
     patience: int = eqx.field(default=10, converter=functools.partial(whole, "patience"))
     log: Log | None = None
     checkpoint: str | Path | None = None
+    progress: bool = True
 
     def __check_init__(self):
         function("evaluate", self.evaluate, "params")
+
+    @classmethod
+    def of(cls, num_steps: int, options: dict[str, Any]) -> "RunOptions":
+        """Return options from those of a call; refuse others by name."""
+        for name in options:
+            one_of("an option", name, [field.name for field in dataclasses.fields(cls)][1:])
+        return cls(num_steps, **options)
 
 
 class Carry(eqx.Module):
@@ -103,7 +112,7 @@ class Descent(Method):
             "start": (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key),
             "over": [None] * key.ndim,
             "segment": math.ceil(self.options.num_steps / NUM_SEGMENTS),
-            **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint")},
+            **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint", "progress")},
         }
 
     def init(self, start: tuple[Vector, PRNGKeyArray]) -> Carry:
@@ -124,16 +133,15 @@ class Descent(Method):
         noise_free, candidate = nan, Best(at, record.cost, record.scale, record.finite_fraction)
         if (evaluate := options.evaluate) is not None:
             is_due = index % options.evaluate_every == 0
-            noise_free = jax.lax.cond(is_due, lambda x: jnp.asarray(evaluate(x), x.dtype), lambda _: nan, at)
+            cost = lambda x: as_scalar(evaluate(x), "evaluate").astype(x.dtype)  # noqa: E731
+            noise_free = jax.lax.cond(is_due, cost, lambda _: nan, at)
             candidate = Best.measured(at, noise_free)
         num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
         num_still = jnp.where(record.reason == Reason.nothing_felt, carry.num_still + 1, 0)
-        # Later reasons to stop override earlier ones.
-        stopped = Stopped.where(index + 1 >= options.num_steps, Stopped.finished, Stopped.running)
+        # Later reasons to stop override earlier ones. That all steps are done is no part of it: a run may go on with more.
         enough = jnp.where(record.step_norm == 0, min(STILL_STEPS, options.patience), options.patience)
-        stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, stopped)
-        most = min(options.patience, options.num_steps)
-        stopped = Stopped.where(num_in_a_row >= most, Stopped.not_finite, stopped)
+        stopped = Stopped.where(num_still >= enough, Stopped.nothing_felt, Stopped.running)
+        stopped = Stopped.where(num_in_a_row >= options.patience, Stopped.not_finite, stopped)
         best = carry.best.against(candidate)
         after = Carry(params, state, carry.key, best, num_in_a_row, num_still, stopped)
         # One of several runs may have stopped before the others.
@@ -144,7 +152,10 @@ class Descent(Method):
         return carry.stopped != Stopped.running
 
     def identity(self) -> dict[str, Any]:
-        return {name: getattr(self.options, name) for name in ("num_steps", "evaluate_every", "patience")}
+        return {name: getattr(self.options, name) for name in ("evaluate_every", "patience")}
+
+    def learnt(self, carry: Carry) -> PyTree:
+        return carry.params
 
     def metrics(self, progress: Progress, count: int) -> dict[str, float]:
         """Return the fields of the last step, the mean over the seeds that took it; NaN for fields without a value."""
@@ -156,27 +167,36 @@ class Descent(Method):
         carry, history = progress.carry, History.of(progress)
         best, final_cost = carry.best, jnp.full_like(carry.best.cost, jnp.nan)
         was_done = np.isfinite(history.scale)  # NaN in steps that did not happen
-        if self.options.evaluate is not None:
-            arrays, static = eqx.partition(self.options.evaluate, eqx.is_array)
-            numbers, structure = jax.tree.flatten(arrays)
-
-            def finish(numbers: list[Array], at: Vector, best: Best) -> tuple[Scalar, Best]:
-                cost = jnp.asarray(eqx.combine(jax.tree.unflatten(structure, numbers), static)(at), at.dtype)
-                return cost, best.against(Best.measured(at, cost))  # the last point competes with the best before
-
-            of_all = jax.jit(jax.vmap(finish, (None, 0, 0)) if carry.params.ndim == 2 else finish)
-            final_cost, best = compile_once(of_all.lower(numbers, carry.params, best))(numbers, carry.params, best)
+        num_steps = was_done.sum(axis=-1)
+        chosen = lambda of, one, other: jax.tree.map(lambda x, y: jnp.where(of, x, y), one, other)  # noqa: E731
+        at_end = Stopped.interrupted if progress.is_interrupted else Stopped.finished
+        at_end = chosen(carry.num_in_a_row >= num_steps, Stopped.not_finite, at_end)
+        stopped = chosen(carry.stopped == Stopped.running, at_end, carry.stopped)
+        if self.options.evaluate is not None and not progress.is_interrupted:
+            numbers, form = parted(self.options.evaluate)
+            final_cost, best = _finish(form, carry.params.ndim == 2)(numbers, carry.params, best)
         return Optimisation(
             params=carry.params,
             best_params=best.params,
             best_cost=best.cost,
             final_cost=final_cost,
             history=history,
-            stopped=carry.stopped,
-            num_steps=np.asarray(was_done.sum(axis=-1)),
+            stopped=stopped,
+            num_steps=np.asarray(num_steps),
             num_skipped=np.asarray((was_done & ~history.is_taken).sum(axis=-1)),
             num_rollouts=history.num_rollouts[..., -1],
             num_gradient_rollouts=history.num_gradient_rollouts[..., -1],
             seconds=float(progress.seconds.sum()),
             compile_seconds=progress.compile_seconds,
         )
+
+
+@functools.lru_cache(maxsize=16)
+def _finish(evaluate: Form, is_many: bool) -> Callable[[list[Array], Vector, Best], tuple[Scalar, Best]]:
+    """Return the program that measures the last point, which competes with the best before."""
+
+    def finish(numbers: list[Array], at: Vector, best: Best) -> tuple[Scalar, Best]:
+        cost = as_scalar(evaluate(numbers)(at), "evaluate").astype(at.dtype)
+        return cost, best.against(Best.measured(at, cost))
+
+    return jax.jit(jax.vmap(finish, (None, 0, 0)) if is_many else finish)

@@ -64,14 +64,18 @@ def optimise(
         optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.
         num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
-        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`; see `RunOptions`.
+        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`, `progress`; see `RunOptions`.
+
+    Returns:
+        The result; after Ctrl-C that of the steps done, `stopped` being `Stopped.interrupted`.
 
     Raises:
+        KeyboardInterrupt: if Ctrl-C came before the end of the first step.
         ValueError: if `objective` and `annealing` do not belong together, a number is out of range, shapes do not fit,
             or a checkpoint is damaged or from another run.
     """
     vector, restore = flattened(params, 1 + jnp.ndim(key))
-    chosen = RunOptions(num_steps, **options)
+    chosen = RunOptions.of(num_steps, options)
     if restore is not None and chosen.evaluate is not None:
         chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
     method = GradientStep(chosen, of_vector(objective, restore), estimator, optimiser, annealing)
@@ -98,7 +102,7 @@ class GradientStep(Descent):
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
-        function("estimator", self.estimator, "objective", "params", "key")
+        function("estimator", self.estimator, "objective", "params", "key", is_needed=True)
         instance(
             "optimiser", self.optimiser, optax.GradientTransformation, "of optax with its settings, as optax.adam(1e-2)"
         )

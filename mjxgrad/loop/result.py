@@ -21,6 +21,7 @@ class Stopped(eqx.Enumeration):
 
     running = "it has not stopped"
     finished = "all steps were done"
+    interrupted = "it was interrupted"
     not_finite = "too many estimates in a row were not finite"
     nothing_felt = (
         "in several steps in a row all samples cost the same and no derivative differed from zero: nothing that the "

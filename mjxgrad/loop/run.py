@@ -8,6 +8,8 @@ import hashlib
 import io
 import json
 import math
+import sys
+import threading
 import time
 import zipfile
 from abc import abstractmethod
@@ -23,17 +25,19 @@ from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from mjxgrad._arrays import function, instance
-from mjxgrad._programs import compile_once
-from mjxgrad._text import write
+from mjxgrad._programs import Form, parted, patiently
+from mjxgrad._text import duration, write
 from mjxgrad.batched.device import all_devices
 
 Log = Callable[[int, dict[str, float]], Any]
 _FORMAT = 3  # of checkpoints
 _PARTS = {
-    "program": "the code of environment, objective, estimator, optimiser, method or versions of the libraries",
+    "program": "a rate or other number, or the code, of environment, objective, estimator or optimiser, or a library's version",
     "arrays": "arrays in environment, objective or method",
     "start": "params or key",
 }
+_PULSE = 0.5  # s of steps in one call, so that progress is shown and Ctrl-C loses little
+_LONG = 10.0  # s, from which a run says what it will take
 
 
 class Progress(NamedTuple):
@@ -44,6 +48,7 @@ class Progress(NamedTuple):
     # Wall-clock time of each step, without compilation, measured per segment and divided among its steps.
     seconds: Float[np.ndarray, " steps"]
     compile_seconds: float = 0.0  # time of tracing and compilation in this session
+    is_interrupted: bool = False  # whether Ctrl-C ended it
 
     @property
     def num_steps(self) -> int:
@@ -71,6 +76,10 @@ class Method(eqx.Module):
     def identity(self) -> dict[str, Any]:
         """Return named values that a resumed run must share, besides the program, the start and `shared`."""
         return {}
+
+    def learnt(self, carry: PyTree) -> PyTree:
+        """Return the arrays of a carry that a checkpoint must have as finite numbers."""
+        return ()
 
     def shared(self) -> PyTree:
         """Return what arrays of the method a resumed run must share; by default all."""
@@ -113,105 +122,111 @@ def run(
     over: Sequence[list[int | None] | None] = (),
     log: Log | None = None,
     checkpoint: str | Path | None = None,
+    progress: bool = True,
     on_all_devices: bool = False,
+    what: tuple[str, str] = ("optimise", "step"),
 ) -> Any:
-    """Repeat a method until it is over, and return its `result`.
+    """Repeat a method until it is over or Ctrl-C ends it, and return its `result`.
+
+    Ctrl-C before the end of the first step is a KeyboardInterrupt.
 
     Args:
         method: the method.
         start: argument of the method's `init`.
         num_steps: largest number of steps.
-        segment: steps in one program; logs and checkpoints come between segments.
+        segment: steps between two logs or checkpoints.
         over: axes of the method's arrays for each leading axis of the start: None for many starts of one method, else the
             list from `side_by_side`. All runs are in one program.
         log: function called after every segment with the number of steps done and the method's `metrics`.
         checkpoint: file to save the run in after every segment, and to resume it from.
+        progress: whether a run of more than ten seconds tells on stderr what it will take, and how far it is.
         on_all_devices: whether all devices of all processes get the arrays, for a method that spreads its work over them.
+        what: words for the run and one of its steps.
 
     Raises:
         ValueError: if the checkpoint has no folder, is damaged, or from a run with another program, arrays or start.
     """
     function("log", log, "step", "metrics")
-    instance("checkpoint", checkpoint, str | Path | None, "the path of a file")
-    checkpoint = None if checkpoint is None else Path(checkpoint)
-    if checkpoint is not None and not checkpoint.parent.is_dir():
-        raise ValueError(
-            f"checkpoint must be in a folder that exists, got {checkpoint}; make {checkpoint.parent} first"
-        )
-    arrays, static = eqx.partition(method, eqx.is_array)
-    # A list, since the structure holds functions: runs of one program then have arguments of equal structure.
-    numbers, structure = jax.tree.flatten(arrays)
-    sharding = _everywhere() if on_all_devices else None
+    instance("progress", progress, bool, "True or False")
+    path = _checkpoint(checkpoint)
+    numbers, form = parted(method)
+    sharding, is_first = _everywhere() if on_all_devices else None, jax.process_index() == 0
     numbers, start = _placed((numbers, start), sharding)
-
-    def init(numbers: list[Array], start: PyTree) -> PyTree:
-        return eqx.combine(jax.tree.unflatten(structure, numbers), static).init(start)
-
-    def step(numbers: list[Array], carry: PyTree, index: Int[Array, ""]) -> tuple[PyTree, PyTree]:
-        return eqx.combine(jax.tree.unflatten(structure, numbers), static).step(carry, index)
-
-    for axes in reversed(over):
-        # The step number is not mapped: a `lax.cond` on it stays a branch instead of computing both sides.
-        init, step = jax.vmap(init, (axes, 0)), jax.vmap(step, (axes, 0, None))
-    carry = compile_once(jax.jit(init, out_shardings=sharding).lower(numbers, start))(numbers, start)
-    # Traced once for the shapes of the records, for the text of the program, and for the segment.
-    began, step = time.perf_counter(), jax.jit(step)
-    traced = step.trace(numbers, carry, np.int32(0))
-    steps = jax.jit(_steps(step, traced.out_info[1], method.is_over, segment), out_shardings=sharding)
-    nothing = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), traced.out_info[1])
-    progress = Progress(carry, nothing, np.zeros(0), time.perf_counter() - began)
+    axes = tuple(None if one is None else tuple(one) for one in over)
+    init, step, steps = _programs(form, axes, segment, sharding)
+    meter = _Meter(*what, num_steps, progress and is_first, log is not None)
+    began = time.perf_counter()
+    # By shapes alone, so that the program of a resumed run is that of one that begins.
+    begun = init.trace(numbers, start)
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), begun.out_info)
+    traced = step.trace(numbers, like, np.int32(0))
+    done = Progress(like, jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), traced.out_info[1]), np.zeros(0))
     identity = {}
-    if checkpoint is not None:
+    if path is not None:
         # Classes of one name may differ in code. The lowered program has every number that is no argument, such as a rate.
         text = np.frombuffer(traced.lower().as_text().encode(), np.uint8)
         parts = {"start": start, "arrays": eqx.filter(method.shared(), eqx.is_array), "program": text}
         identity = method.identity() | {name: _digest(part) for name, part in parts.items()}
-    if checkpoint is not None and checkpoint.exists():
-        carry, found, seconds = _load(checkpoint, progress[:3], identity)
-        progress = Progress(_placed(carry, sharding), found, seconds, progress.compile_seconds)
-    on_disk, compiled, is_first = progress.num_steps, None, jax.process_index() == 0
+    if path is not None and path.exists():
+        carry, found, seconds = _load(path, done[:3], identity)
+        if not all(np.isfinite(x).all() for x in jax.tree.leaves(method.learnt(carry))):
+            raise ValueError(
+                f"checkpoint must hold finite parameters, got {path} with NaN or infinity; use another path"
+            )
+        done = Progress(_placed(carry, sharding), found, seconds)
+    else:
+        first = patiently(begun.lower().compile)
+        done = done._replace(carry=patiently(lambda: jax.block_until_ready(first(numbers, start))))
+    on_disk, logged, program = done.num_steps, done.num_steps, None
     try:
-        while (done := progress.num_steps) < num_steps and not np.all(method.is_over(progress.carry)):
-            given = numbers, progress.carry, np.int32(done), np.int32(min(done + segment, num_steps))
-            if compiled is None:
-                began = time.perf_counter()
-                compiled = compile_once(steps.lower(*given))
-                progress = progress._replace(compile_seconds=progress.compile_seconds + time.perf_counter() - began)
-            progress = _after(progress, functools.partial(compiled, *given))
-            if checkpoint is not None and is_first:
-                _save(checkpoint, progress[:3], identity)
-                on_disk = progress.num_steps
-            if log is not None and is_first:
-                log(progress.num_steps, method.metrics(progress, progress.num_steps - done))
+        while (count := done.num_steps) < num_steps and not np.all(method.is_over(done.carry)):
+            if program is None:
+                lowered = steps.lower(numbers, like, np.int32(0), np.int32(0))
+                program = meter.compiled(lowered.compile)
+                done = done._replace(compile_seconds=time.perf_counter() - began)
+            border = min(count - count % segment + segment, num_steps)
+            # Hosts must take as many steps as each other, whatever their clocks say.
+            end = border if jax.process_count() > 1 else min(border, count + meter.next_steps())
+            done = meter.advanced(done, functools.partial(program, numbers, done.carry, np.int32(count), np.int32(end)))
+            if done.num_steps == border or np.all(method.is_over(done.carry)):
+                if path is not None and is_first:
+                    _save(path, done[:3], identity)
+                    on_disk = done.num_steps
+                if log is not None and is_first:
+                    since, logged = done.num_steps - logged, done.num_steps
+                    log(done.num_steps, method.metrics(done, since))
+    except KeyboardInterrupt:
+        if not done.num_steps:
+            raise
+        done = done._replace(is_interrupted=True)
     finally:
-        # Also after an interruption of a save: KeyboardInterrupt goes on to the caller.
-        if checkpoint is not None and is_first and progress.num_steps > on_disk:
-            _save(checkpoint, progress[:3], identity)
-    return method.result(progress)
+        meter.end()
+        if path is not None and is_first and done.num_steps > on_disk:
+            _save(path, done[:3], identity)
+    return method.result(done)
 
 
-def mean(values: Shaped[np.ndarray, "..."]) -> float:
-    """Return the mean of the finite values; NaN if there are none."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else math.nan
+@functools.lru_cache(maxsize=32)
+def _programs(form: Form, over: tuple, segment: int, sharding: jax.sharding.Sharding | None) -> tuple[Any, Any, Any]:
+    """Return the programs of a method's `init`, of a step, and of the steps of a segment; once for each form."""
 
+    def init(numbers: list[Array], start: PyTree) -> PyTree:
+        return form(numbers).init(start)
 
-def _after(progress: Progress, program: Callable[[], tuple[Array, PyTree, PyTree]]) -> Progress:
-    """Run a segment and return the progress with its records appended."""
-    began = time.perf_counter()
-    reached, carry, rows = jax.block_until_ready(program())
-    count = int(reached) - progress.num_steps
-    new = rows, np.full(count, (time.perf_counter() - began) / count)
-    found, seconds = jax.tree.map(lambda old, new: np.concatenate([old, np.asarray(new)[:count]]), progress[1:3], new)
-    return Progress(carry, found, seconds, progress.compile_seconds)
+    def step(numbers: list[Array], carry: PyTree, index: Int[Array, ""]) -> tuple[PyTree, PyTree]:
+        return form(numbers).step(carry, index)
 
-
-def _steps(step: Callable, found: PyTree, is_over: Callable, segment: int) -> Callable:
-    """Return the program of a segment: steps up to a given number, fewer if all runs are over before."""
+    for axes in reversed(over):
+        axes = axes if axes is None else list(axes)
+        # The step number is not mapped: a `lax.cond` on it stays a branch instead of computing both sides.
+        init, step = jax.vmap(init, (axes, 0)), jax.vmap(step, (axes, 0, None))
+    step = jax.jit(step)
 
     def steps(numbers: list[Array], carry: PyTree, first: Array, end: Array) -> tuple[Array, PyTree, PyTree]:
+        """Take steps up to a given number, fewer if all runs are over before."""
+
         def is_going(now: tuple[Array, PyTree, PyTree]) -> Bool[Array, ""]:
-            return (now[0] < end) & ~jnp.all(is_over(now[1]))
+            return (now[0] < end) & ~jnp.all(form(numbers).is_over(now[1]))
 
         def advance(now: tuple[Array, PyTree, PyTree]) -> tuple[Array, PyTree, PyTree]:
             index, carry, rows = now
@@ -220,10 +235,86 @@ def _steps(step: Callable, found: PyTree, is_over: Callable, segment: int) -> Ca
             return index + 1, carry, jax.tree.map(put, rows, row)
 
         # A while_loop can end early but stacks no outputs, so the records are written into arrays of full length.
+        found = jax.eval_shape(step, numbers, carry, first)[1]
         rows = jax.tree.map(lambda x: jnp.zeros((segment, *x.shape), x.dtype), found)
         return jax.lax.while_loop(is_going, advance, (first, carry, rows))
 
-    return steps
+    return jax.jit(init, out_shardings=sharding), step, jax.jit(steps, out_shardings=sharding)
+
+
+class _Meter:
+    """Tell on stderr how long a run will take, and how far it is; decide how many steps to take at a time."""
+
+    def __init__(self, run: str, step: str, num_steps: int, tells: bool, has_log: bool):
+        self.run, self.step, self.num_steps, self.tells, self.has_log = run, step, num_steps, tells, has_log
+        self.seconds = self.began = self.last = 0.0  # of a step; when the first began; when something was told
+        self.is_shown = False
+
+    def compiled(self, compile: Callable[[], Any]) -> Any:
+        """Compile, and tell of it where it takes long."""
+        if not self.tells:
+            return patiently(compile)
+        text = f"{self.run}: compiling, once for these shapes; mg.keep_compiled() keeps programs on disk"
+        timer = threading.Timer(2.0, self.tell, (text,))
+        timer.start()
+        try:
+            return patiently(compile)
+        finally:
+            timer.cancel()
+
+    def next_steps(self) -> int:
+        """Return how many steps to take in one call."""
+        return max(1, int(_PULSE / self.seconds)) if self.seconds else 1
+
+    def advanced(self, done: Progress, program: Callable[[], tuple[Array, PyTree, PyTree]]) -> Progress:
+        """Take steps, return the progress with their records appended, and tell what is left."""
+        began = time.perf_counter()
+        self.began = self.began or began
+        reached, carry, rows = patiently(lambda: jax.block_until_ready(program()))
+        now, count = time.perf_counter(), int(reached) - done.num_steps
+        self.seconds = (now - began) / count
+        new = rows, np.full(count, self.seconds)
+        found, seconds = jax.tree.map(lambda old, new: np.concatenate([old, np.asarray(new)[:count]]), done[1:3], new)
+        left = (self.num_steps - int(reached)) * self.seconds
+        if self.is_shown and not self.has_log and now - self.last > (0.9 if sys.stderr.isatty() else 30):
+            self.tell(f"{self.run}: {self.step} {reached} of {self.num_steps}, about {duration(left)} left")
+        elif not self.is_shown and left > _LONG and now - self.began > 2 * _PULSE:
+            once = f"{duration(self.seconds)} {'an' if self.step[0] in 'aeiou' else 'a'} {self.step}"
+            self.tell(f"{self.run}: {once}, about {duration(left)} for {self.num_steps}; Ctrl-C keeps what was found\n")
+            self.is_shown = True
+        return done._replace(carry=carry, found=found, seconds=seconds)
+
+    def tell(self, text: str) -> None:
+        """Write a line over the one before, where there is a terminal."""
+        self.last = time.perf_counter()
+        start, end = ("\r\x1b[K", "") if sys.stderr.isatty() else ("", "" if text.endswith("\n") else "\n")
+        print(start + text, end=end, file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Remove the last line about what is left."""
+        if self.last and sys.stderr.isatty():
+            self.tell("")
+
+
+def _checkpoint(path: str | Path | None) -> Path | None:
+    """Return the path of a checkpoint; refuse folders, and what is in none."""
+    instance("checkpoint", path, str | Path | None, "the path of a file")
+    if path is None:
+        return None
+    if not Path(path).parent.is_dir():
+        remedy = f"make {Path(path).parent} first"
+        raise ValueError(f"checkpoint must be in a folder that exists, got {path}; {remedy}")
+    if Path(path).is_dir():
+        raise ValueError(
+            f"checkpoint must be the path of a file, got the folder {str(path)!r}; add a name, as in 'run.npz'"
+        )
+    return Path(path)
+
+
+def mean(values: Shaped[np.ndarray, "..."]) -> float:
+    """Return the mean of the finite values; NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else math.nan
 
 
 def _everywhere() -> jax.sharding.Sharding | None:
@@ -265,7 +356,7 @@ def _load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"checkpoint must be a file that a run has saved, got {path}, which cannot be read ({error}); "
-            "delete it to begin anew"
+            "delete it, or give another path, to begin anew"
         ) from error
     expected = {"format": _FORMAT, **fingerprint}
     differing = {name: value for name, value in expected.items() if header.get(name) != value}
@@ -296,8 +387,10 @@ def _as_numpy(leaf: Any) -> np.ndarray:
 
 
 def _restored(saved: np.ndarray | Array, like: Any) -> Any:
-    if isinstance(like, jax.Array) and jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(like))
+    if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+        found: list[Any] = []
+        jax.eval_shape(lambda key: found.append(jax.random.key_impl(key)), like)
+        return jax.random.wrap_key_data(jnp.asarray(saved), impl=found[0])
     if saved.dtype.kind == "V":  # NumPy's format has no name for bfloat16 and its like
-        saved = saved.view(np.asarray(like).dtype)
+        saved = saved.view(like.dtype)
     return saved if isinstance(like, np.ndarray) else jnp.asarray(saved)

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import instance, whole
+from mjxgrad._arrays import function, instance, whole
 from mjxgrad.objective.base import (
     Differentiated,
     Objective,
@@ -331,5 +331,6 @@ def linear_policy(
         ValueError: if a number is below 1.
     """
     sizes = whole("num_states", num_states), whole("num_controls", num_controls)
+    function("observe", observe, "state", is_needed=True)
     drawn = eqx.nn.Linear(*sizes, use_bias=bias, key=jax.random.key(0))
     return LinearPolicy(observe), jax.tree.map(jnp.zeros_like, drawn)

@@ -18,7 +18,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function as check_function
-from mjxgrad._arrays import instance, real
+from mjxgrad._arrays import instance, real, whole
 from mjxgrad.objective.task import as_pytree
 
 Scalar = Float[Array, ""]
@@ -211,8 +211,8 @@ def positive(stddev: Stddev) -> Float[Array, "..."]:
     stddev = real("stddev", stddev)
     stddev = jnp.asarray(stddev, jnp.result_type(stddev, float))
     # A traced value (a noise schedule, a sweep) cannot be checked here.
-    if not isinstance(stddev, jax.core.Tracer) and not bool((stddev > 0).all()):
-        raise ValueError(f"stddev must be positive, got {stddev}")
+    if not isinstance(stddev, jax.core.Tracer) and not bool(((stddev > 0) & (stddev < jnp.inf)).all()):
+        raise ValueError(f"stddev must be positive and finite, got {stddev}")
     return stddev
 
 
@@ -253,8 +253,8 @@ def parameter_noise(
     Raises:
         ValueError: if `stddev` is not positive, or neither one number nor `dim` of them.
     """
-    check_function("function", function, "params")
-    width = positive(stddev)
+    check_function("function", function, "params", is_needed=True)
+    dim, width = None if dim is None else whole("dim", dim), positive(stddev)
     if width.ndim > 1 or (width.ndim == 1 and dim not in (None, width.shape[0])):
         raise ValueError(f"stddev must be one number or {dim or 'dim'}, got shape {width.shape}")
     dim = width.shape[0] if width.ndim == 1 else dim

@@ -4,16 +4,18 @@ import dataclasses
 import functools
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import form, function, whole
+from mjxgrad._arrays import form, function, one_of, whole
 from mjxgrad.contact import Softness
+from mjxgrad.engines.state import check_scene
 from mjxgrad.rollouts import Observe, Policy, Sees, State, Trajectory, rollout
+from mjxgrad.rollouts.rollout import check_start
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, EngineName, Slope, check_contact
 
@@ -85,6 +87,9 @@ class InScene(eqx.Module):
     scene: Scene
     contact: Contact = eqx.field(default=Slope(), kw_only=True)
 
+    def __check_init__(self):
+        check_scene(self.scene)
+
     def with_contact(self: Same, contact: Contact) -> Same:
         """Return a copy whose contacts are stepped otherwise."""
         check_contact(contact)
@@ -120,7 +125,9 @@ class SceneTask(Task, InScene):
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
     def __check_init__(self):
-        function("cost", self.cost, "trajectory")
+        check_start(self.scene, self.state)
+        one_of("policy_sees", self.policy_sees, get_args(Sees))
+        function("cost", self.cost, "trajectory", is_needed=True)
         function("start_distribution", self.start_distribution, "key")
         function("observe", self.observe, "model", "data")
 

@@ -15,8 +15,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mjxgrad._arrays import instance, whole
+from mjxgrad._arrays import instance, real, whole, within
 from mjxgrad._text import write
+from mjxgrad.batched.device import fits
 from mjxgrad.scene import Scene
 
 Number = int | float
@@ -67,7 +68,7 @@ def frames(
     height, width = whole("height", height, None), whole("width", width, None)
     if timestep is None:
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
-    positions = np.asarray(qpos, dtype=np.float64)
+    positions = np.asarray(real("qpos", qpos), dtype=np.float64)
     _check(mj_model, positions, timestep=timestep, fps=fps, speed=speed, height=height, width=width)
     mj_model = copy.copy(mj_model)
     mj_model.vis.global_.offheight = max(height, mj_model.vis.global_.offheight)
@@ -75,7 +76,9 @@ def frames(
     data = mujoco.MjData(mj_model)
     last, states_per_frame = len(positions) - 1, speed / fps / timestep
     # The last state counts as reached despite rounding in its time.
-    shown = np.arange(int(last / states_per_frame + 1e-6) + 1)
+    count = int(last / states_per_frame + 1e-6) + 1
+    fits(f"{count} frames", 3.0 * count * height * width, "less fps, a higher speed, or smaller ones", is_on_host=True)
+    shown = np.arange(count)
     nearest = np.minimum(np.rint(shown * states_per_frame).astype(int), last)
     view, drawn = mujoco.MjvCamera(), []
     mujoco.mjv_defaultFreeCamera(mj_model, view)
@@ -125,6 +128,9 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
 
     instance("path", path, str | os.PathLike, "the path of a file")
     path, video = Path(path), np.asarray(video)
+    within("fps", fps, 0, np.inf, "positive")
+    if path.suffix.lower() != ".mp4" or path.is_dir():
+        raise ValueError(f"path must be of a file that ends in .mp4, got {path}")
     if video.ndim != 4 or not len(video) or video.shape[3] != 3:
         raise ValueError(f"video must have shape (frames, height, width, 3), got {video.shape}")
     if not path.parent.is_dir():
@@ -138,8 +144,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
 
 def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) -> None:
     for name, value in positive.items():
-        if not value > 0:
-            raise ValueError(f"{name} must be positive, got {value}")
+        within(name, value, 0, np.inf, "positive")
     if positions.ndim != 2 or positions.shape[1] != mj_model.nq or not len(positions):
         raise ValueError(f"qpos must have shape (states, nq) = (at least 1, {mj_model.nq}), got {positions.shape}")
     if not np.isfinite(positions).all():
@@ -184,6 +189,8 @@ def _renderer(mj_model: mujoco.MjModel, height: int, width: int) -> "mujoco.Rend
     # MuJoCo, PyOpenGL, glfw and the drivers raise errors without a common class.
     except Exception as error:
         reason = str(error).partition(",")[0] or type(error).__name__
+        if "framebuffer" in reason.lower():
+            raise ValueError(f"height and width must be no more than OpenGL draws, got {height} and {width}") from None
         chosen = os.environ.get("MUJOCO_GL", "")
         if chosen and chosen.lower().strip() not in ("egl", "glfw", "osmesa"):
             raise RenderingUnavailableError(f"MUJOCO_GL must be egl, glfw, osmesa or unset, got {chosen}") from None

@@ -2,14 +2,16 @@
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from mjxgrad._arrays import function, instance, known, real, whole
+from mjxgrad.batched.device import copies, fits
 from mjxgrad.engines import Motion, Observe, Policy, Rows, Sees, State, Trajectory, engine_of
 from mjxgrad.engines.layout import INPUTS
 from mjxgrad.engines.state import check_scene
@@ -70,15 +72,21 @@ def rollout(
     engine = engine_of(scene, contact)
     for message in smoothing_warnings(scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    if policy_sees not in ("state", "observations") or (policy_sees == "observations" and observe is None):
+    if policy_sees not in get_args(Sees) or (policy_sees == "observations" and observe is None):
         raise ValueError(f'policy_sees must be "state", or "observations" with observe=, got {policy_sees!r}')
     function("observe", observe, "model", "data")
     instance("checkpoint", checkpoint, bool, "True or False")
+    instance("measure_growth", measure_growth, bool, "True or False")
     policy = controls if callable(controls) else None
     function("policy", policy, "params", "state")
     if policy is None and params is not None:
         raise ValueError("params must belong to a policy, got them beside a sequence of controls: give noise as noise=")
     sequence, horizon = sequence_of(controls, noise, horizon, scene.model.nu)
+    many = max(map(copies, jax.tree.leaves((state, controls, params, noise, inputs))))
+    row = scene.model.nq + scene.model.nv + scene.model.na + scene.model.nu
+    size = many * horizon * row * state.qpos.dtype.itemsize
+    worlds = f"{horizon} steps" if many == 1 else f"{many} rollouts of {horizon} steps"
+    fits(worlds, size, "fewer at a time, such as jax.lax.map(function, starts, batch_size=256), or shorter ones")
     forces = applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     rows = Rows(base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
@@ -166,6 +174,7 @@ def check_start(scene: Any, state: Any) -> None:
 def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:
     """Return the further inputs of each step; refuse unknown ones."""
     found = {}
+    instance("inputs", inputs, Mapping | None, "a dict of arrays by name")
     for name, value in ({} if inputs is None else inputs).items():
         if name not in INPUTS[1:]:
             raise ValueError(f"inputs must be among {', '.join(INPUTS[1:])}, got {name!r}")

@@ -6,7 +6,7 @@ import math
 import os
 import warnings
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._arrays import instance, real, whole
+from mjxgrad._arrays import instance, one_of, real, whole
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad._warnings import collected
 from mjxgrad.batched.device import own_device
@@ -79,8 +79,9 @@ def load_scene(
         SceneError: if MuJoCo cannot read the MJCF, or nothing in it can move. Where MJX is asked for, also if MJX cannot
             simulate it, with all unsupported features, or loading would take minutes by the number of geom pairs.
     """
-    if softness is not None:
-        instance("softness", softness, Softness, "mg.Softness, such as mg.Softness(stiffness=1e4)")
+    instance("softness", softness, Softness | None, "mg.Softness, such as mg.Softness(stiffness=1e4)")
+    one_of("engine", engine, (*get_args(EngineName), None))
+    instance("keep_everything", keep_everything, bool, "True or False")
     if max_contacts is not None and whole("max_contacts", max_contacts, None) < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:

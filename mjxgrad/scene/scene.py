@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import instance, is_known, real
+from mjxgrad._arrays import instance, is_known, one_of, real
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants, tree
@@ -83,8 +83,7 @@ class Scene(eqx.Module):
             ValueError: if there is no such engine.
             SceneError: if MJX cannot step the scene.
         """
-        if engine not in get_args(EngineName):
-            raise ValueError(f'engine must be "mjx" or "mujoco", got {engine!r}')
+        one_of("engine", engine, get_args(EngineName))
         if engine == "mjx" and self.unsupported:
             raise SceneError(self.unsupported)
         return dataclasses.replace(self, chosen=engine)
@@ -135,7 +134,7 @@ class Scene(eqx.Module):
             if name not in arrays:
                 near = difflib.get_close_matches(name, arrays, n=3)
                 remedy = f"did you mean {' or '.join(near)}?" if near else "see MuJoCo's documentation of mjModel"
-                raise ValueError(f"with_model must name arrays of numbers of the MJX model, got {name}; {remedy}")
+                raise ValueError(f"with_model must name arrays of numbers of the model, got {name}; {remedy}")
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}

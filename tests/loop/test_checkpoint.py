@@ -55,10 +55,15 @@ def uninterrupted():
 
 @pytest.mark.parametrize("error", [KilledError, KeyboardInterrupt])
 def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uninterrupted, error):
+    """Ctrl-C returns what was found; any other error goes on to the caller."""
     path = tmp_path / "run.npz"
     for step in (7, 35):
-        with pytest.raises(error):
-            run(path, log=kill_at(step, error))
+        if error is KilledError:
+            with pytest.raises(error):
+                run(path, log=kill_at(step, error))
+        else:
+            result = run(path, log=kill_at(step, error))
+            assert (result.num_steps, result.stopped) == (step + step % 2, mg.Stopped.interrupted)
     steps = []
     resumed = run(path, log=lambda step, _: steps.append(step))
     assert steps == [38, 40]
@@ -68,6 +73,21 @@ def test_a_run_that_is_killed_and_resumed_is_the_uninterrupted_one(tmp_path, uni
 def test_a_finished_run_is_read_without_running(tmp_path, uninterrupted):
     path = tmp_path / "run.npz"
     run(path)
+    assert_same(run(path, log=kill_at(0, KilledError)), uninterrupted)
+
+
+def test_a_finished_run_goes_on_with_more_steps(tmp_path, uninterrupted):
+    path = tmp_path / "run.npz"
+    assert run(path, num_steps=30).stopped == mg.Stopped.finished
+    assert_same(run(path), uninterrupted)
+
+
+def test_a_link_to_a_checkpoint_stays_one(tmp_path, uninterrupted):
+    path, link = tmp_path / "disk" / "run.npz", tmp_path / "run.npz"
+    path.parent.mkdir()
+    link.symlink_to(path)
+    run(link)
+    assert link.is_symlink()
     assert_same(run(path, log=kill_at(0, KilledError)), uninterrupted)
 
 
@@ -89,9 +109,8 @@ def written(tmp_path_factory):
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"num_steps": 41}, "num_steps was 40 and is 41"),
         ({"patience": 8}, "patience was 10 and is 8"),
-        ({"rate": 0.06}, "objective, estimator, optimiser, method or versions of the libraries"),
+        ({"rate": 0.06}, "a rate or other number, or the code, of environment, objective, estimator or optimiser"),
         ({"key": jax.random.key(3)}, "params or key"),
     ],
 )
@@ -109,7 +128,7 @@ def flipped(content):
 def test_a_damaged_checkpoint_is_refused(tmp_path, written, damaged):
     path = tmp_path / "run.npz"
     path.write_bytes(damaged(written.read_bytes()))
-    with pytest.raises(ValueError, match=r"checkpoint must be a file that a run has saved, .*delete it to begin anew"):
+    with pytest.raises(ValueError, match=r"checkpoint must be a file .*delete it, or give another path"):
         run(path)
 
 

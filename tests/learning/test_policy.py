@@ -1,0 +1,44 @@
+"""A policy leaves the library: its file, and the ten lines of NumPy that run it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad.learning import Policy
+from mjxgrad.learning.networks import Network, Normaliser
+
+
+@pytest.fixture
+def policy(key):
+    seen = 3 * jax.random.normal(key, (50, 6)) + jnp.arange(6.0)
+    return Policy(Network.make((6, 32, 16, 3), key), Normaliser.make(6).with_more(seen))
+
+
+def test_a_policy_that_is_loaded_is_the_saved_one_to_the_bit(policy, tmp_path):
+    policy.save(tmp_path / "policy.npz")
+    for one, other in zip(*map(jax.tree.leaves, (policy, Policy.load(tmp_path / "policy.npz"))), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_numpy_runs_a_saved_policy(policy, tmp_path):
+    """The lines of HOWTO."""
+    policy.save(tmp_path / "policy.npz")
+    net = np.load(tmp_path / "policy.npz")
+
+    def act(obs):
+        x = (obs - net["mean"]) / net["scale"]
+        for i in range(2):
+            x = net[f"weight{i}"] @ x + net[f"bias{i}"]
+            x = np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+            x = (x - x.mean()) / np.sqrt(x.var() + 1e-5) * net[f"gain{i}"] + net[f"offset{i}"]
+        return np.tanh(net["weight2"] @ x + net["bias2"])
+
+    for obs in np.random.default_rng(0).normal(size=(5, 6)):
+        np.testing.assert_allclose(act(obs), policy(jnp.asarray(obs)), atol=1e-6)
+
+
+def test_several_policies_are_not_one_file(policy, tmp_path):
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), policy)
+    with pytest.raises(ValueError, match="policy must be one, got several"):
+        both.save(tmp_path / "policy.npz")

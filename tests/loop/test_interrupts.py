@@ -1,0 +1,64 @@
+"""Ctrl-C ends a run within a second and keeps what was found; a long run says at once what it will take."""
+
+import os
+import signal
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxgrad.loop import Method, run
+
+PAUSE = 0.1  # s
+
+
+class Slow(Method):
+    """A count, each step of which takes a tenth of a second in a thread of C++."""
+
+    def init(self, start):
+        return start
+
+    def step(self, carry, index):
+        def wait(x):
+            time.sleep(PAUSE)
+            return np.asarray(x)
+
+        after = jax.pure_callback(wait, jax.ShapeDtypeStruct((), carry.dtype), carry + 1)
+        return after, {"count": after}
+
+
+def test_ctrl_c_keeps_the_steps_done_and_a_price_was_told(tmp_path, capfd):
+    """A thousand steps of 0.1 s are 100 s, which is foretold to a factor of two from the steps of the first second."""
+    path, sent = tmp_path / "run.npz", []
+
+    def stop():
+        sent.append(time.perf_counter())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Timer(2.5, stop).start()
+    done = run(Slow(), jnp.zeros(()), num_steps=1000, segment=50, checkpoint=path)
+    assert time.perf_counter() - sent[0] < 1.0
+    assert done.is_interrupted
+    np.testing.assert_array_equal(done.found["count"], 1 + np.arange(done.num_steps))
+    assert 5 <= done.num_steps <= 2.5 / PAUSE
+    told = capfd.readouterr().err
+    foretold = float(told.partition("about ")[2].split()[0])
+    assert "a step" in told
+    assert "min for 1000" in told
+    assert 50 < 60 * foretold < 200
+    again = run(Slow(), jnp.zeros(()), num_steps=done.num_steps + 1, segment=50, checkpoint=path)
+    assert (again.num_steps, again.is_interrupted) == (done.num_steps + 1, False)
+
+
+def test_ctrl_c_before_any_step_is_one():
+    threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        run(Slow(), jnp.zeros(()), num_steps=1000, segment=50)
+
+
+def test_a_short_run_says_nothing(capfd):
+    run(Slow(), jnp.zeros(()), num_steps=3, segment=2)
+    assert capfd.readouterr().err == ""
