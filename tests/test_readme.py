@@ -37,6 +37,8 @@ def _finds_the_parameters(names):
 def _stands(names):
     """All 100 actions upright and near the origin earn 100 less a few; a pole that falls ends its episode before."""
     assert names["judged"].returns.mean() > 90
+    obs = np.linspace(-0.3, 0.3, 6)
+    np.testing.assert_allclose(names["act"](obs), names["learned"].policy(jnp.asarray(obs)), atol=1e-5)
     assert Path("balance.mp4").stat().st_size > 1000
 
 
