@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad.identification.normal import solved, split, squares
+from mjxgrad.identification.normal import at, solved, split
 from mjxgrad.rollouts import DivergedError
 
 # Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
@@ -97,14 +97,13 @@ def fit(
         ) in _CHATTER:  # its tails are longer than the normal's; the misfit tells where the recording has more
             factors, sureness = model.weighed(noise, chatter)
             step = solved(factors, dim, (box[0] - middle, box[1] - middle))
-            if squares(factors, step.values, step.starts) < most:
+            if step.squares < most:
                 break
         length = float(np.linalg.norm(np.linalg.lstsq(root, step.values, rcond=None)[0]))
         change = step.values * min(1.0, _LONGEST / max(length, 1e-300))
         by_start, mixed, slope, _ = split(factors, dim)
         inner = np.linalg.pinv(by_start)
-        moved = -np.einsum("wij,wj->wi", inner, mixed @ np.append(change, 1.0))
-        misfit = squares(factors, change, moved)
+        moved, misfit = at(factors, change)
         at_end = factors * sureness
         at_end[..., -1] = 0.0  # nothing is left to go
         growth = np.sqrt(max(misfit / (count * noise**2), 1.0)) * noise

@@ -11,11 +11,12 @@ from jaxtyping import Float
 
 
 class Step(NamedTuple):
-    """The step to the least squares, and how far it goes in standard errors, squared."""
+    """The step to the least squares, how far it goes in standard errors, squared, and the sum of squares there."""
 
     values: Float[np.ndarray, " dim"]
     starts: Float[np.ndarray, "windows free"]
     length: float
+    squares: float
 
 
 def factors_of(
@@ -64,12 +65,14 @@ def solved(
         bounds = bounds[:, is_free] * lengths[is_free]
         bounds = np.stack([bounds[0], np.maximum(bounds[1], bounds[0] + 1e-12)])
         values[is_free] = scipy.optimize.lsq_linear(scaled[:, is_free], -residual, bounds).x / lengths[is_free]
-    both = np.append(values, 1.0)
-    starts = -np.einsum("wij,wj->wi", np.linalg.pinv(by_start), mixed @ both)
-    return Step(values, starts, float(np.sum((slope @ values) ** 2)))
+    starts, squares = at(factors, values)
+    return Step(values, starts, float(np.sum((slope @ values) ** 2)), squares)
 
 
-def squares(factors: np.ndarray, values: np.ndarray, starts: np.ndarray) -> float:
-    """Return the sum of squares after a step, if all were linear."""
-    every = np.concatenate([starts, np.broadcast_to(np.append(values, 1.0), (len(starts), len(values) + 1))], axis=1)
-    return float(np.sum(np.einsum("wij,wj->wi", factors, every) ** 2))
+def at(factors: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the best starts at a step of the values, and the sum of squares there."""
+    by_start, mixed, slope, residual = split(factors, len(values))
+    left = mixed @ np.append(values, 1.0)
+    starts = -np.einsum("wij,wj->wi", np.linalg.pinv(by_start), left)
+    missed = left + np.einsum("wij,wj->wi", by_start, starts)
+    return starts, float(np.sum(missed**2) + np.sum((slope @ values + residual) ** 2))

@@ -283,3 +283,16 @@ def test_the_end_of_a_recording_is_foretold_from_the_start_that_was_found_for_it
     assert result.held_out_rms[1] < 3 < result.held_out_rms[0]
     other = dataclasses.replace(late, measured={**parts[1], "qvel": speed + 1e-6})
     assert mg.identify(cart, gear, [early], held_out=[other]).held_out_rms[1] > 5
+
+
+def test_a_recording_of_places_alone_is_cut_into_windows_that_start_at_their_speeds(cart):
+    """Speeds of the cart by its places over nine rows, within their noise and what the drive changes meanwhile."""
+    noise = {"qpos": 1e-4}
+    windows = Recording({"qpos": _course()}, _DRIVE[:, None], noise=noise).cut(0.1, _STEP)
+    speeds = np.gradient(_course(), _STEP)
+    assert len(windows) == 4
+    for i, window in enumerate(windows[1:], 1):
+        np.testing.assert_allclose(window.measured["qvel"][0], speeds[10 * i], atol=0.02)
+        assert np.isnan(window.measured["qvel"][1:]).all()
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, windows[1:])
+    np.testing.assert_allclose(result.values["gear"], 3.0, rtol=0.02)
