@@ -21,9 +21,9 @@ from mjxgrad.planning.system import Cost, System, check_problem
 from mjxgrad.planning.trajectory import Course, Problem, checked
 from mjxgrad.rollouts import State
 
-PARTS = ("linear models", "backward pass", "rollouts")
+PARTS: tuple[str, ...] = ("linear models", "backward pass", "rollouts")
 """Of an iteration, in their order."""
-_KNOTS = 4  # of a random change of a plan
+_PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first plan has
 _FADING = 0.8  # of what a part is expected to take, if it took less
 
 
@@ -104,7 +104,7 @@ class Controller(Printed):
         """Compile the three parts, at once."""
         began, number = time.perf_counter(), self._schedules[0][0]
         numbers, rest = eqx.partition(self.cost, eqx.is_inexact_array_like)
-        self._blank = jax.tree.map(np.asarray, problem.begin(self.system.origin, controls))
+        self._blank = problem.begin(self.system.origin, controls)
         of = lambda numbers: dataclasses.replace(problem, cost=eqx.combine(numbers, rest))  # noqa: E731
         parts = (
             lambda numbers, search, factor, *_: of(numbers).linearised(search, factor),
@@ -114,7 +114,9 @@ class Controller(Printed):
         given = numbers, self._blank, number, number, np.bool_(True), self._noise(0)
         lowered = [jax.jit(part).lower(*given) for part in parts]
         with ThreadPoolExecutor(len(PARTS)) as threads:
-            self._programs = dict(zip(PARTS, threads.map(lambda one: one.compile(), lowered), strict=True))
+            self._programs: dict[str, Any] = dict(
+                zip(PARTS, threads.map(lambda one: one.compile(), lowered), strict=True)
+            )
         self.compile_seconds = time.perf_counter() - began
 
     def _measure(self) -> None:
@@ -173,15 +175,17 @@ class Controller(Printed):
 
     def _begin(self, start: np.ndarray, is_first: bool) -> None:
         """Shift all by a step, to the present state; the first time compute the course of the given controls."""
-        later = lambda x: np.concatenate([x[1:], x[-1:]]) if np.ndim(x) else x  # noqa: E731
-        # The new course of the shifted plan is not computed: the feedback law around the old one takes the difference.
-        horizon, search = len(self._blank.law.change), self._search
+        # By NumPy: JAX would compile programs. The new course of the shifted plan is not computed: the feedback law around the
+        # old one takes the difference.
+        later = lambda x: jax.device_put(np.concatenate([x[1:], x[-1:]])) if np.ndim(x) else x  # noqa: E731
+        search, horizon = self._search, len(self._blank.law.change)
         if not is_first:
             parts = {name: jax.tree.map(later, getattr(search, name)) for name in ("best", "models", "law")}
             search = dataclasses.replace(search, **parts)
-        states = np.tile(start, (horizon + 1, 1)) if is_first else search.best.states
+        states = np.tile(start, (horizon + 1, 1)) if is_first else np.array(search.best.states)
         states[0] = start
-        course = Course(states, search.best.controls, np.full_like(search.best.cost, np.inf))  # pyright: ignore
+        unknown = jax.device_put(np.full_like(search.best.cost, np.inf))
+        course = Course(jax.device_put(states), search.best.controls, unknown)
         self._search = dataclasses.replace(search, course=course, best=course)
         if is_first:
             self._advance("rollouts", *2 * [self._schedules[0][0]], is_first=True)
@@ -190,19 +194,16 @@ class Controller(Printed):
         """Run a part of an iteration; its time is what the next is expected to take."""
         began, numbers = time.perf_counter(), eqx.filter(self.cost, eqx.is_inexact_array_like)
         given = factor, following, np.bool_(is_first), self._noise(len(self.seconds))
-        self._search = jax.tree.map(np.asarray, self._programs[part](numbers, self._search, *given))
+        self._search = jax.block_until_ready(self._programs[part](numbers, self._search, *given))
         self._last[part] = time.perf_counter() - began
         self._expected[part] = max(self._last[part], _FADING * self._expected[part])
 
     def _noise(self, seed: int) -> Float[np.ndarray, "N horizon m"]:
-        """Return changes of the controls that are linear between four of them, each plan's larger than the last one's."""
+        """Return changes of the controls, each held for a quarter of the plan, and each plan's larger than the last one's."""
         horizon, size = self._blank.course.controls.shape
-        knots = np.random.default_rng(seed).normal(size=(self.num_samples, min(_KNOTS, horizon), size)) * self.stddev
-        at = np.linspace(0, knots.shape[1] - 1, horizon)
-        low = np.minimum(at.astype(int), max(knots.shape[1] - 2, 0))
-        share = (at - low)[:, None]
-        noise = (1 - share) * knots[:, low] + share * knots[:, np.minimum(low + 1, knots.shape[1] - 1)]
-        return (np.geomspace(0.125, 1, self.num_samples)[:, None, None] * noise).astype(self._origin.dtype)
+        sizes = np.geomspace(_SMALLEST, 1, self.num_samples)[:, None, None] * self.stddev
+        noise = sizes * np.random.default_rng(seed).normal(size=(self.num_samples, _PIECES, size))
+        return np.repeat(noise, -(-horizon // _PIECES), axis=1)[:, :horizon].astype(self._origin.dtype)
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
         parts = [getattr(state, name) for name in ("qpos", "qvel", "act")] if hasattr(state, "qpos") else [state]

@@ -29,13 +29,12 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from mjxgrad._arrays import is_known, known, whole
 from mjxgrad._text import name_pairs
-from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System
+from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System, resting
 from mjxgrad.stepping import Smoothing
 from mjxgrad.stepping.smoothing import Mode
 
@@ -114,16 +113,11 @@ class Analytic(Smoother):
         given, pairs = system.scene.model, [pair for pair in system.scene.pairs if pair.condim > 1]
         if not all(is_known(x) for x in (start, given.geom_size, given.body_pos, given.geom_pos)):
             return []
-        model = system.scene.to_mujoco()
-        data = mujoco.MjData(model)
-        data.qpos[:] = start[: model.nq]
-        mujoco.mj_fwdPosition(model, data)
-        is_fixed = model.body_weldid[model.geom_bodyid] == 0
-        touching = {frozenset(geoms) for geoms in data.contact.geom.tolist() if is_fixed[geoms].any()}
-        resting = [pair for pair in pairs if {pair.geom1, pair.geom2} in touching]
-        if not resting:
+        touching = {frozenset(geoms) for geoms in resting(system.scene.to_mujoco(), start[: given.nq]).tolist()}
+        held = [pair for pair in pairs if {pair.geom1, pair.geom2} in touching]
+        if not held:
             return []
-        told = f"smoothing also reaches {name_pairs(resting)}, which touch at the start: their friction then acts at a distance"
+        told = f"smoothing also reaches {name_pairs(held)}, which touch at the start: their friction then acts at a distance"
         return [f"{told}, and bodies that should slide or roll hardly move; for planning set their condim to 1"]
 
 

@@ -191,10 +191,8 @@ class SceneSystem(System):
         is fixed, in the reference pose, are as they were: what stands on the floor would else hover.
         """
         model, given = self.scene.mj_model, self.scene.model
-        mujoco.mj_fwdPosition(model, data := mujoco.MjData(model))
-        is_fixed, pairs = model.body_weldid[model.geom_bodyid] == 0, np.reshape(data.contact.geom, (-1, 2)).astype(int)
-        is_wide = ~is_fixed
-        is_wide[pairs[is_fixed[pairs].any(axis=1)]] = False
+        is_wide = model.body_weldid[model.geom_bodyid] != 0
+        is_wide[resting(model, model.qpos0)] = False
         reach = _REACH * jnp.asarray(length)
         solimp = given.geom_solimp.at[:, 2].set(reach).at[:, jnp.array([0, 3, 4])].set(jnp.array([1e-4, 0.9, 3.0]))
         return dataclasses.replace(
@@ -209,6 +207,15 @@ class SceneSystem(System):
     def with_contact(self, contact: Contact) -> "SceneSystem":
         check_contact(contact, is_step=True)
         return dataclasses.replace(self, contact=contact)
+
+
+def resting(model: mujoco.MjModel, qpos: Float[ArrayLike, " nq"]) -> Int[np.ndarray, "contacts 2"]:
+    """Return the pairs of geoms that touch in a pose, of which one is fixed."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    pairs = np.array(data.contact.geom, int).reshape(-1, 2)
+    return pairs[(model.body_weldid[model.geom_bodyid] == 0)[pairs].any(axis=1)]
 
 
 class Cost(eqx.Module):

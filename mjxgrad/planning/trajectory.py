@@ -28,7 +28,6 @@ from mjxgrad.rollouts.rollout import sequence_of
 
 _Row = Float[Array, "*iterations"]
 _Scalar = Float[Array, ""]
-_Held = Array | np.ndarray  # on the host a search is held as NumPy's arrays
 _Matrix = Float[Array, "m m"]
 _Controls = Float[Array, "horizon m"]
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
@@ -116,11 +115,11 @@ class Feedback(eqx.Module):
 
 
 class Course(eqx.Module):
-    """A trajectory, its controls and its cost; on the host of NumPy's arrays."""
+    """A trajectory, its controls and its cost."""
 
-    states: Float[_Held, "states state"]
-    controls: Float[_Held, "horizon m"]
-    cost: Float[_Held, ""]
+    states: Float[Array, "states state"]
+    controls: _Controls
+    cost: _Scalar
 
 
 class Search(eqx.Module):
@@ -128,10 +127,10 @@ class Search(eqx.Module):
 
     course: Course
     best: Course
-    regularisation: Float[_Held, ""]
+    regularisation: _Scalar
     models: LinearModel
     law: Feedback
-    unmoved: Bool[_Held, " n"]
+    unmoved: Bool[Array, " n"]
 
 
 class Problem(eqx.Module):

@@ -17,7 +17,7 @@ PUSHER = """<mujoco><option timestep=".005"/><worldbody><geom name="floor" type=
   <body pos="0 0 .05"><freejoint name="box"/><geom type="box" size=".05 .05 .05" mass=".3"/></body></worldbody><actuator>
   <position joint="x" kp="100" kv="10" ctrlrange="-1 1"/><position joint="y" kp="100" kv="10" ctrlrange="-1 1"/>
   </actuator></mujoco>"""
-GOAL, SUBSTEPS = np.array([0.15, 0.03]), 6
+GOAL, SUBSTEPS, KEY = np.array([0.15, 0.03]), 6, jax.random.key(0)
 NOTHING = "no control moves 'box' .coordinates .2.* add the distance"
 
 
@@ -38,7 +38,7 @@ class Push(LeastSquares):
 
 @pytest.fixture(scope="module")
 def system():
-    return SceneSystem(mg.load_scene(PUSHER, engine="mujoco"), num_substeps=SUBSTEPS)
+    return SceneSystem(scene=mg.load_scene(PUSHER, engine="mujoco"), num_substeps=SUBSTEPS)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,7 @@ def controller(made):
     return made
 
 
+@pytest.mark.filterwarnings("ignore:no control moves")
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.03, -0.03)])
 def test_a_box_is_pushed_to_its_goal(controller, place):
     model = mujoco.MjModel.from_xml_string(PUSHER)
@@ -71,24 +72,25 @@ def test_where_nothing_is_touched_a_warning_says_what_to_do(controller, system):
     assert "Controls are as given, since no control moves 'box'" in str(controller)
 
 
+@pytest.mark.filterwarnings("ignore:no control moves")
 def test_a_deadline_is_kept_where_an_iteration_takes_longer(controller, system, monkeypatch):
-    """Parts of 50 ms and a deadline of 140: two are done in each decision, an iteration in one or two, and the plan improves."""
+    """Parts of 100 ms and a deadline of 280: two are done in a decision, the third in the next, and the plan improves."""
 
     def slow(program):
-        return lambda *given: time.sleep(0.05) or program(*given)
+        return lambda *given: time.sleep(0.1) or program(*given)
 
     start, costs = np.asarray(system.origin), []
     monkeypatch.setattr(controller, "_programs", {name: slow(one) for name, one in controller._programs.items()})
     controller(start)
-    controller.deadline = 0.14
-    for _ in range(15):
+    controller.deadline = 0.28
+    for _ in range(12):
         controller(start)
         costs.append(controller.plan.cost)
-    assert controller.num_missed <= 2
-    assert controller.num_cut >= 12
-    assert "16 decisions" in str(controller)
+    assert controller.num_missed <= 3
+    assert controller.num_cut >= 4
+    assert "13 decisions" in str(controller)
     finite = np.array(costs)[np.isfinite(costs)]
-    assert 4 < len(finite) < 14
+    assert 3 < len(finite) < 10
     assert finite[-1] < 0.9 * finite[0]
 
 
@@ -117,13 +119,13 @@ def test_samples_touch_what_derivatives_do_not_see(system):
 def test_widened_contacts_of_c_mujoco_act_from_a_distance(system):
     """The gap is 6 cm: four lengths reach it or do not. What stands on the floor stays there."""
     state, control = system.origin, jnp.array([0.05, 0.0])
-    far = Analytic(mg.Smoothing(0.03)).linear_model(system, state, control, None)
-    near = Analytic(mg.Smoothing(0.011)).linear_model(system, state, control, None)
-    none = Exact().linear_model(system, state, control, None)
+    far = Analytic(mg.Smoothing(0.03)).linear_model(system, state, control, KEY)
+    near = Analytic(mg.Smoothing(0.011)).linear_model(system, state, control, KEY)
+    none = Exact().linear_model(system, state, control, KEY)
     assert far.B[8 + 2, 0] > 1e-3
     np.testing.assert_allclose(near.B, none.B, atol=1e-6)
-    end = Analytic(mg.Smoothing(0.011)).step(system, state, control, None)
+    end = Analytic(mg.Smoothing(0.011)).step(system, state, control, KEY)
     np.testing.assert_allclose(end, system.step(state, control), atol=1e-6)
     backward = Analytic(mg.Smoothing(0.03, mode="backward"))
-    np.testing.assert_allclose(backward.step(system, state, control, None), system.step(state, control), atol=1e-9)
-    np.testing.assert_allclose(backward.linear_model(system, state, control, None).B, far.B, atol=1e-6)
+    np.testing.assert_allclose(backward.step(system, state, control, KEY), system.step(state, control), atol=1e-9)
+    np.testing.assert_allclose(backward.linear_model(system, state, control, KEY).B, far.B, atol=1e-6)
