@@ -49,6 +49,12 @@ try:
         from mujoco.mjx._src.math import make_frame
         from mujoco.mjx._src.passive import _fluid as fluid_force
         from mujoco.mjx._src.passive import _gravcomp as compensate_gravity
+except AttributeError as error:
+    if (other := sys.modules.get("warp")) is None:
+        raise
+    raise ImportError(
+        f"MuJoCo's MJX takes {next(iter(getattr(other, '__path__', ['warp.py'])))} for NVIDIA Warp: rename it ({error})"
+    ) from None
 finally:
     sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
 

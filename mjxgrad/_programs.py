@@ -1,5 +1,6 @@
 """Compiled programs, kept within a process and from one process to the next."""
 
+import atexit
 import collections
 import functools
 import hashlib
@@ -217,7 +218,17 @@ def patiently(call: Callable[[], Any]) -> Any:
         STOPPED.set()
         thread.join(0.7)
         STOPPED.clear()
+        atexit.register(_leave, thread)
         raise
+
+
+def _leave(thread: threading.Thread) -> None:
+    """End the process where C++ goes on in an abandoned thread, which Python would wait for or tear out with a crash."""
+    atexit.unregister(_leave)
+    if thread.is_alive():
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        os._exit(130)
 
 
 _KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()

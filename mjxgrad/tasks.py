@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from mjxgrad.contact import Softness
 from mjxgrad.objective import ActionNoise, ParameterNoise, closed_loop, linear_policy, open_loop, parameter_noise
 from mjxgrad.objective.base import Stddev
-from mjxgrad.objective.task import InScene, Outcome, Policy, SceneTask, Task, finite_cost
+from mjxgrad.objective.task import InScene, Outcome, PolicyFunction, SceneTask, Task, finite_cost
 from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
 
@@ -40,7 +40,7 @@ class ActionTask(SceneTask):
     """
 
     start_params: PyTree = eqx.field(kw_only=True)
-    policy: Policy | None = eqx.field(kw_only=True, default=None)
+    policy: PolicyFunction | None = eqx.field(kw_only=True, default=None)
     stddev: float = eqx.field(static=True, kw_only=True, default=0.1)
 
     def objective(self, stddev: Stddev | None = None, softness: Softness | None = None) -> ActionNoise:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad.objective.task import Outcome, Policy, Task
+from mjxgrad.objective.task import Outcome, PolicyFunction, Task
 
 
 class QuadraticCost(eqx.Module):
@@ -54,7 +54,7 @@ class DynamicsTask(Task):
 
     def run(
         self,
-        controls: Float[Array, "horizon nu"] | Policy,
+        controls: Float[Array, "horizon nu"] | PolicyFunction,
         params: PyTree = None,
         noise: Float[Array, "horizon nu"] | None = None,
         start: Float[Array, " states"] | None = None,

@@ -1,6 +1,6 @@
 """Who steps a scene, and takes derivatives of its steps: MJX or C MuJoCo, behind the same calls."""
 
-from mjxgrad.engines.engine import Engine, Motion, Observe, Policy, Rows, Sees
+from mjxgrad.engines.engine import Engine, Motion, Observe, PolicyFunction, Rows, Sees
 from mjxgrad.engines.mjx import MJX
 from mjxgrad.engines.mujoco import MuJoCo
 from mjxgrad.engines.state import DivergedError, State, Trajectory
@@ -29,6 +29,6 @@ def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
 
 
 __all__ = [
-    "ENGINES", "QUICK", "DivergedError", "Engine", "Motion", "Observe", "Policy", "Rows", "Sees", "State", "Trajectory",
+    "ENGINES", "QUICK", "DivergedError", "Engine", "Motion", "Observe", "PolicyFunction", "Rows", "Sees", "State", "Trajectory",
     "engine_of",
 ]  # fmt: skip

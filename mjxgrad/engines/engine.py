@@ -16,7 +16,7 @@ from mjxgrad.engines.state import State, Trajectory
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact
 
-Policy = Callable[[PyTree, Any], Float[Array, " nu"]]
+PolicyFunction = Callable[[PyTree, Any], Float[Array, " nu"]]
 """Function from policy parameters and the state or observations to controls."""
 Observe = Callable[[mjx.Model, mjx.Data], PyTree]
 """Function from model and data to a pytree of arrays."""
@@ -29,7 +29,7 @@ class Motion(eqx.Module):
     """How a scene moves; the arguments of `rollout`, by the same names."""
 
     scene: Scene
-    policy: Policy | None
+    policy: PolicyFunction | None
     params: PyTree
     observe: Observe | None
     policy_sees: Sees

@@ -26,7 +26,7 @@ from mjxgrad.objective.base import (
     unchanged,
     value_and_gradient,
 )
-from mjxgrad.objective.task import Outcome, Policy, Task, as_pytree
+from mjxgrad.objective.task import Outcome, PolicyFunction, Task, as_pytree
 from mjxgrad.rollouts import State
 
 
@@ -161,7 +161,7 @@ class ClosedLoop(ActionNoise):
     """The cost of a task under a policy with noise on its actions; see `closed_loop`."""
 
     task: Task
-    policy: Policy
+    policy: PolicyFunction
     stddev: Float[Array, "..."]
     unravel: Callable[[Vector], PyTree] = eqx.field(static=True)
     dim: int | None = eqx.field(static=True)
@@ -203,7 +203,7 @@ def open_loop(task: Task, stddev: Stddev) -> OpenLoop:
     return OpenLoop(task=task, stddev=stddev, dim=task.horizon * task.num_controls)
 
 
-def closed_loop(task: Task, policy: Policy, stddev: Stddev, *, params: PyTree = None) -> ClosedLoop:
+def closed_loop(task: Task, policy: PolicyFunction, stddev: Stddev, *, params: PyTree = None) -> ClosedLoop:
     r"""Return the cost of a task as a function of a policy's parameters, with noise on its actions.
 
     The action is $u_t = \pi_\theta(x_t) + w_t$. The score of a rollout is
@@ -234,7 +234,7 @@ def closed_loop(task: Task, policy: Policy, stddev: Stddev, *, params: PyTree = 
 class _OfVector(eqx.Module):
     """A policy that says what it was given where it cannot take a vector."""
 
-    policy: Policy
+    policy: PolicyFunction
 
     def __call__(self, params: Vector, state: PyTree) -> Float[Array, " nu"]:
         try:
@@ -262,7 +262,9 @@ class _ActionsTranspose:
 
     unravel: Callable[[Vector], PyTree]
 
-    def __call__(self, policy: Policy, params: Vector, states: PyTree, by_actions: Float[Array, " m"]) -> Vector:
+    def __call__(
+        self, policy: PolicyFunction, params: Vector, states: PyTree, by_actions: Float[Array, " m"]
+    ) -> Vector:
         def actions(flat: Vector) -> Float[Array, " m"]:
             return jnp.ravel(jax.vmap(lambda state: policy(self.unravel(flat), state))(states))
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from mjxgrad._arrays import form, function, one_of, whole
 from mjxgrad.contact import Softness
 from mjxgrad.engines.state import check_scene
-from mjxgrad.rollouts import Observe, Policy, Sees, State, Trajectory, rollout
+from mjxgrad.rollouts import Observe, PolicyFunction, Sees, State, Trajectory, rollout
 from mjxgrad.rollouts.rollout import check_start
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, EngineName, Slope, check_contact
@@ -47,7 +47,7 @@ class Task(eqx.Module):
     @abstractmethod
     def run(
         self,
-        controls: Float[Array, "horizon nu"] | Policy,
+        controls: Float[Array, "horizon nu"] | PolicyFunction,
         params: PyTree = None,
         noise: Float[Array, "horizon nu"] | None = None,
         start: PyTree = None,
@@ -144,7 +144,7 @@ class SceneTask(Task, InScene):
 
     def run(
         self,
-        controls: Float[Array, "horizon nu"] | Policy,
+        controls: Float[Array, "horizon nu"] | PolicyFunction,
         params: PyTree = None,
         noise: Float[Array, "horizon nu"] | None = None,
         start: State | None = None,

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from mjxgrad._arrays import function, instance, known, real, whole
 from mjxgrad.batched.device import copies, fits
-from mjxgrad.engines import Motion, Observe, Policy, Rows, Sees, State, Trajectory, engine_of
+from mjxgrad.engines import Motion, Observe, PolicyFunction, Rows, Sees, State, Trajectory, engine_of
 from mjxgrad.engines.layout import INPUTS
 from mjxgrad.engines.state import check_scene
 from mjxgrad.scene import Scene, SceneWarning
@@ -22,7 +22,7 @@ from mjxgrad.stepping import Contact, Discrete, Slope, Smoothing, smoothing_warn
 def rollout(
     scene: Scene,
     state: State,
-    controls: Float[ArrayLike, "_ _"] | Policy | None = None,
+    controls: Float[ArrayLike, "_ _"] | PolicyFunction | None = None,
     params: PyTree = None,
     noise: Float[ArrayLike, "_ _"] | None = None,
     *,
@@ -131,7 +131,7 @@ def linearise(
 
 
 def sequence_of(
-    controls: ArrayLike | Policy | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
+    controls: ArrayLike | PolicyFunction | None, noise: ArrayLike | None, horizon: int | None, num_controls: int
 ) -> tuple[Array | None, int]:
     """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
     given = {"controls": None if callable(controls) else controls, "noise": noise}
