@@ -18,6 +18,7 @@ import mjxgrad as mg
 from experiments.motion import own_task
 from experiments.optimisation.published import TASKS
 from experiments.problems import ASSETS, textbook
+from experiments.problems.comparison import over_keys
 from experiments.report import Bold, Table, tabulated
 from experiments.settings import OwnScene, Positive, RunSettings
 from experiments.theme import FIRST, MUTED, ONSET, ZEROTH, Drawings, subplots
@@ -241,9 +242,8 @@ _antithetic = functools.partial(mg.estimators.zeroth_order, antithetic=True)
 
 def _by_many(settings: Settings, objective: Objective, params: Array, estimator: Callable) -> tuple[np.ndarray, float]:
     """Return the mean of large unbiased estimates, and its squared error."""
-    run = jax.jit(lambda key: estimator(objective, params, key, num_samples=2000).value)
     keys = jax.random.split(jax.random.key(settings.seed + 2), max(2, settings.num_truth // 2000))
-    found = np.array([run(key) for key in keys], float)
+    found = np.asarray(over_keys(estimator, objective, params, keys, num_samples=2000).value, float)
     return found.mean(axis=0), float(found.var(axis=0, ddof=1).sum() / len(found))
 
 
@@ -360,16 +360,10 @@ def tables(outcome: Outcome) -> list[Table]:
     rows = []
     for cell in outcome.told:
         low, high = cell.ratio_interval
-        row = {
-            "problem": cell.problem,
-            "derivative": cell.derivative,
-            "numbers": str(cell.dim),
-            "samples": str(cell.batch),
-        }
-        row |= {name: quantity(cell.error[name]) for name in shown} | {
-            "bias of first order": percent(cell.bias),
-            "α": f"{cell.alpha:.2f}",
-        }
+        row = {"problem": cell.problem, "derivative": cell.derivative}
+        row |= {"numbers": str(cell.dim), "samples": str(cell.batch)}
+        row |= {name: quantity(cell.error[name]) for name in shown}
+        row |= {"bias of first order": percent(cell.bias), "α": f"{cell.alpha:.2f}"}
         ratio = (Bold if high < 0.9 else str)(f"{cell.ratio:.2f} ({low:.2f} to {high:.2f})")
         rows.append(row | {"α-order over the better part": ratio})
     caption = (

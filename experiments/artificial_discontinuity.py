@@ -13,6 +13,7 @@ from pydantic import Field
 from scipy.stats import norm
 
 import mjxgrad as mg
+from experiments.problems.comparison import over_keys
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
 from experiments.theme import DEFAULT, FIRST, MUTED, ONSET, OTHERS, REFERENCE, ZEROTH, Drawings, legend_below, subplots
@@ -187,9 +188,9 @@ def _by_noise(case: Case, settings: Settings, name: str, place: float, truth: fl
     """Return the root mean squared error of 32 estimates, over the slope."""
     function = case.function(PLAIN, settings, mg.Slope())
     objective, at = mg.parameter_noise(lambda x: function(x[0]), case.stddev, 1), jnp.array([place])
-    estimator = functools.partial(getattr(mg.estimators, name), num_samples=settings.num_samples)
-    estimate = jax.jit(lambda keys: jax.lax.map(lambda key: estimator(objective, at, key).value[0], keys))
-    return float(jnp.sqrt(jnp.mean((estimate(jax.random.split(jax.random.key(settings.seed), 32)) / truth - 1) ** 2)))
+    keys = jax.random.split(jax.random.key(settings.seed), 32)
+    found = over_keys(getattr(mg.estimators, name), objective, at, keys, settings.num_samples)
+    return float(jnp.sqrt(jnp.mean((found.value / truth - 1) ** 2)))
 
 
 def secant_slope(simulate: Callable, place: float, stddev: float, count: int, seed: int) -> float:
@@ -226,15 +227,7 @@ def verdict(outcome: Outcome) -> str:
 def tables(outcome: Outcome) -> list[Table]:
     """Tabulate remedies."""
     rows = [[*row[:3], *map(percent, row[3:])] for one in outcome.found for row in one.rows]
-    columns = (
-        "case",
-        "remedy",
-        "derivative",
-        "outcome changed by",
-        "largest jump",
-        "error",
-        "error for its own outcome",
-    )
+    columns = ("case", "remedy", "derivative", "outcome changed by", "largest jump", "error", "own error")
     caption = (
         "Errors of the mean derivative under noise, over the slope of the mean outcome as it is; last, against the remedied "
         f"outcome's slope. Of noise, root mean squared at {outcome.settings.num_samples} rollouts. Changes and jumps are over "

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float
-from pydantic import Field, model_validator
+from pydantic import Field
 
 import mjxgrad as mg
 from experiments.problems.untouched import Untouched, billiards, hard_cost, hard_optimum, rolling_pin
@@ -27,7 +27,7 @@ TaskName = Literal["billiards", "rolling_pin"]
 _TASKS: dict[TaskName, Callable[[], Untouched]] = {"billiards": billiards, "rolling_pin": rolling_pin}
 IDLE: dict[TaskName, float] = {"billiards": 2.0, "rolling_pin": 1.0}  # the cost of what stays untouched
 _CAMERAS: dict[TaskName, str] = {"billiards": "above", "rolling_pin": "side"}
-_FINAL_SCALE = 0.02  # left at the last step of noise and reach; radius and margin are then taken away
+_FINAL_SCALE = 0.02  # left of reach at the last step; radius and margin are then taken away
 _EVALUATIONS = 60  # how often along a descent the true cost is measured
 
 
@@ -44,6 +44,8 @@ class MethodSettings(SettingsTable):
     """Control of the start, constant along each axis."""
     stddev: Positive = 1e-6
     """Of the noise on each control at the start; the default is none to speak of."""
+    final_noise: Annotated[float, Field(gt=0, le=1)] = 0.02
+    """Share of the noise that is left in the end."""
     num_samples: Several = 2
     """Rollouts per step."""
     proximity: Positive | None = None
@@ -65,6 +67,8 @@ class Settings(RunSettings):
     """What is to be moved by what does not touch it."""
     methods: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
     """In the order of the legend."""
+    size: Literal["quick", "default"] = "default"
+    """The quick size takes the first three methods alone."""
     num_steps: Annotated[int, Field(ge=10)] = 80
     """Of each descent."""
     learning_rate: Positive = 0.1
@@ -75,13 +79,6 @@ class Settings(RunSettings):
     """Cost that counts as solved."""
     video: VideoSettings | None = None
     """Of the worst end and the best; without it, none is made."""
-
-    @model_validator(mode="after")
-    def _check(self) -> "Settings":
-        labels = [method.label for method in self.methods]
-        if len(set(labels)) < len(labels):
-            raise ValueError("labels of methods must differ")
-        return self
 
 
 @dataclass(frozen=True)
@@ -147,10 +144,8 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     workspace.check(task.scene)
     play = jax.jit(lambda params: task.trajectory(params).qpos)
     keys = jax.random.split(jax.random.key(settings.seed), len(settings.methods))
-    parts = {
-        f"{i}": functools.partial(_run, method, task, settings, keys[i], play)
-        for i, method in enumerate(settings.methods)
-    }
+    chosen = settings.methods[: 3 if settings.size == "quick" else None]
+    parts = {f"{i}": functools.partial(_run, one, task, settings, keys[i], play) for i, one in enumerate(chosen)}
     runs = workspace.each("descents", "methods", parts)
     slope = jax.jit(jax.grad(lambda params: task.error(task.trajectory(params))))(task.start(settings.methods[0].start))
     return Outcome(settings, runs, float(jnp.abs(slope).max()))
@@ -165,6 +160,7 @@ class Seen(eqx.Module):
     margin: Float[Array, ""]
     length: Float[Array, ""]
     stddev: Float[Array, ""]
+    final_noise: Float[Array, ""]
     mode: str | None = eqx.field(static=True)  # of the kernel; None has none
 
     def __call__(self, scale: Float[Array, ""]) -> mg.Objective:
@@ -172,14 +168,14 @@ class Seen(eqx.Module):
         reach = jnp.where(scale > _FINAL_SCALE**0.9, scale, 0.0)
         task = self.task.seen_from_afar(self.proximity, reach * self.radius, reach * self.margin)
         task = task if self.mode is None else task.with_contact(Smoothing(scale * self.length, self.mode))
-        return task.objective(scale * self.stddev)
+        return task.objective(self.stddev * self.final_noise ** (jnp.log(scale) / np.log(_FINAL_SCALE)))
 
 
 def _run(
     method: MethodSettings, task: Untouched, settings: Settings, key: Array, play: Callable[[Array], Array]
 ) -> Run:
     every = -(-settings.num_steps // _EVALUATIONS)
-    names = ("proximity", "radius", "margin", "length", "stddev")
+    names = ("proximity", "radius", "margin", "length", "stddev", "final_noise")
     numbers = {name: jnp.asarray(getattr(method, name) or 0.0, float) for name in names}
     start, mode = task.start(method.start), method.mode if method.length else None
     rate = optax.cosine_decay_schedule(settings.learning_rate, settings.num_steps, settings.final_rate)
@@ -268,11 +264,11 @@ def tables(outcome: Outcome) -> list[Table]:
         row = {
             "method": run.method.label,
             "touches at the start": "yes" if run.touches_at_start else "no",
-            "cost at the start": quantity(run.cost[0]),
-            "best cost": (Bold if outcome.is_solved(run) else str)(quantity(run.best_cost)),
-            "final cost": quantity(run.cost[-1]),
+            "cost at the start": f"{run.cost[0]:.4g}",
+            "best cost": (Bold if outcome.is_solved(run) else str)(f"{run.best_cost:.4g}"),
+            "final cost": f"{run.cost[-1]:.4g}",
         }
-        row |= {} if run.hard_cost is None else {"with hard balls": quantity(run.hard_cost)}
+        row |= {} if run.hard_cost is None else {"with hard balls": f"{run.hard_cost:.4g}"}
         row |= {
             f"steps to stay below {below}": "never" if first is None else str(run.steps[first]),
             "rollouts for that": "" if first is None else str(run.rollouts[first]),
@@ -290,7 +286,7 @@ def _cost(run: Run) -> float:
 
 
 def _listed(runs: list[Run]) -> str:
-    return joined(f"“{run.method.label}” ({quantity(run.best_cost)})" for run in runs)
+    return joined(f"“{run.method.label}” ({run.best_cost:.4g})" for run in runs)
 
 
 def drawings(outcome: Outcome) -> Drawings:
@@ -305,7 +301,9 @@ def drawings(outcome: Outcome) -> Drawings:
     for axis in (left, right):
         for level in (IDLE[outcome.settings.task], outcome.settings.solved_below):
             axis.axhline(level, color=MUTED, lw=1.0, ls=(0, (1, 2)), zorder=0)
-    left.set(title="Against steps", xlabel="step", ylabel="cost", yscale="log")
+    lowest = min(run.best_cost for run in outcome.runs)
+    scale = "log" if lowest < IDLE[outcome.settings.task] / 10 else "linear"
+    left.set(title="Against steps", xlabel="step", ylabel="cost", yscale=scale)
     right.set(title="Against rollouts", xlabel="rollouts", xscale="log")
     legend_below(figure, left, 4)
     caption = (
@@ -326,6 +324,6 @@ def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tupl
         wanted,
         camera=_CAMERAS[outcome.settings.task],
         caption=f"The motions that two descents end with, {shown_speed(wanted.speed)}; the target is marked.",
-        titles=[f"{run.method.label}: {quantity(run.best_cost)}" for run in chosen],
+        titles=[f"{run.method.label}: {run.best_cost:.4g}" for run in chosen],
         columns=2,
     )

@@ -1,7 +1,7 @@
 """Smoothing kernels: the noise that each softened contact averages over, and what its tail buys far from contact."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from pydantic import Field
 from scipy import stats
 
 import mjxgrad as mg
+from experiments.parallel import in_threads
 from experiments.problems.planar_pusher import planar_pusher
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
@@ -28,10 +29,8 @@ KERNELS: dict[str, tuple[str, str, Any]] = {
     "logistic": ("logistic", ZEROTH, stats.logistic(scale=_SIZE / (2 * np.log(2)))),
     "log_barrier": ("log barrier", ONSET, stats.t(2, scale=_SIZE / np.sqrt(2))),
 }
-_NEAR, _SAMPLED = (
-    np.linspace(-2, 4, 121),
-    slice(0, None, 10),
-)  # distances in lengths, and those where forces are sampled
+# Distances in lengths, and those of them where forces are sampled.
+_NEAR, _SAMPLED = np.linspace(-2, 4, 121), slice(0, None, 10)
 _FAR, _TOLD = np.geomspace(0.1, 100, 31), (10, 20)  # the table tells those at 1 and 10
 # Its impedance is the same at every depth, so that the law is exactly a mean.
 _BALL = """<mujoco model="ball"><option gravity="0 0 0" tolerance="1e-12"/><worldbody>
@@ -51,6 +50,8 @@ class Settings(RunSettings):
     """Samples of the noise for each mean of forces."""
     gaps: tuple[Positive, ...]
     """Gaps between finger and rod at the start of a push (m)."""
+    size: Literal["quick", "default"] = "default"
+    """The quick size takes a tenth of the samples, and the first two gaps."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,12 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Step the ball, sample MuJoCo's force, and plan pushes, by each kernel."""
-    with workspace.stage("kernels", "kernels", len(KERNELS)):
-        kernels = {name: workspace.once(name, lambda name=name: _kernel(settings, name)) for name in KERNELS}
-    return Outcome(settings, kernels, _motion(mg.Discrete(), settings.length * _NEAR)[0])
+    if settings.size == "quick":
+        fewer = {"num_samples": settings.num_samples // 10, "gaps": settings.gaps[:2]}
+        settings = settings.model_copy(update=fewer)
+    with workspace.stage("kernels", "kernels", len(KERNELS)) as advance_to:
+        found = in_threads(lambda name: workspace.once(name, lambda: _kernel(settings, name)), KERNELS, advance_to)
+    return Outcome(settings, dict(zip(KERNELS, found, strict=True)), _motion(mg.Discrete(), settings.length * _NEAR)[0])
 
 
 def _kernel(settings: Settings, name: str) -> Kernel:

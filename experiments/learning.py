@@ -1,6 +1,7 @@
 """Policies through contact: which gradient learns soonest, how good it is meanwhile, and what it is worth in C MuJoCo."""
 
 import itertools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
@@ -80,14 +81,10 @@ class Settings(RunSettings):
     """Learning rate of the policy; if left out, the algorithm's."""
     stddev: tuple[Positive, Positive] | None = None
     """Standard deviations of the noise on actions at the beginning and at the end; if left out, the algorithm's."""
-    critic_rate: Positive = learning.Settings.critic_rate
-    """Learning rate of the value function."""
     trace: Annotated[float, Field(ge=0, le=1)] = learning.Settings.trace
     """λ of the returns that a policy climbs; below 1 derivatives reach less far."""
     largest_sample: Positive = learning.Settings.largest_sample
     """Longer first-order gradients are shortened to it; in units of zeroth-order noise."""
-    num_branches: Annotated[int, Field(ge=2)] = learning.Bundle.num_branches
-    """Of bundled gradients, which learn in so many times fewer environments: by as many derivatives."""
     size: Literal["quick", "default", "full"] = "default"
     """How much is spent."""
     sizes: Sizes
@@ -233,17 +230,17 @@ def _courses(
         )
         history = {name: np.asarray(values) for name, values in found.history.items()}
         learned = [
-            (jax.tree.map(lambda x, i=i: x[i], found.policy), _act, {name: x[:, i] for name, x in history.items()})
+            (
+                jax.tree.map(lambda x, i=i: x[i], found.policy),
+                operator.call,
+                {name: x[:, i] for name, x in history.items()},
+            )
             for i in range(len(factors))
         ]
     return [
         _judged_course(settings, one, method, k, *each)
         for one, k, each in zip(environments, factors, learned, strict=True)
     ]
-
-
-def _act(policy: learning.Policy, obs):
-    return policy(obs)
 
 
 def _by_ppo(
@@ -312,14 +309,13 @@ def _how(settings: Settings, method: Method, environment: Environment) -> learni
     changes: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
     count = settings.sizes.num_environments
     if method == "bundled":
-        count = max(2, count // settings.num_branches)
         weight = 9.81 * float(environment.scene.model.body_mass.sum())
-        changes["bundle"] = learning.Bundle(settings.num_branches, force=_LOADED * weight)
+        changes["bundle"] = bundle = learning.Bundle(force=_LOADED * weight)
+        count = max(2, count // bundle.num_branches)  # as many derivatives as the others take
     wide = learning.Settings.for_gpu if count >= 1024 else learning.Settings
     return (apg if settings.algorithm == "apg" else wide)(
         num_environments=count,
         window=settings.window,
-        critic_rate=settings.critic_rate,
         trace=settings.trace,
         largest_sample=settings.largest_sample,
         alpha={"alpha": None, "zeroth": 0.0}.get(method, 1.0),

@@ -26,8 +26,9 @@ class SettingsTable(BaseModel):
                 raise ValueError(f"must be below 2^31, got {one:.3g}")
         # Twice the same would count as two in tests and answers over all of them; a point may have a coordinate twice.
         if value and isinstance(value, tuple) and "..." in str(cls.model_fields[str(info.field_name)].annotation):
-            one, count = Counter(value).most_common(1)[0]
-            if count > 1 and not isinstance(one, BaseModel):
+            # Methods are told apart by their labels.
+            one, count = Counter(getattr(one, "label", one) for one in value).most_common(1)[0]
+            if count > 1:
                 raise ValueError(f"must differ, got {f'{one:g}' if isinstance(one, float) else one} more than once")
         return value
 

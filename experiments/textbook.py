@@ -64,9 +64,6 @@ class Settings(RunSettings):
             raise ValueError(f"estimators must be of one gradient with noise on the parameters, got {other[0]}")
         if any(one.rule == "bias_constrained" for one in self.estimators):
             raise ValueError("estimators must have rules that need no number, got bias_constrained")
-        labels = [one.label for one in self.estimators]
-        if repeated := {label for label in labels if labels.count(label) > 1}:
-            raise ValueError(f"estimators must differ, got {', '.join(sorted(repeated))} more than once")
         return self
 
 

@@ -105,9 +105,6 @@ class Settings(OwnScene, RunSettings):
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
-        labels = [method.label for method in self.methods]
-        if repeated := {label for label in labels if labels.count(label) > 1}:
-            raise ValueError(f"methods must differ, got {', '.join(sorted(repeated))} more than once")
         if self.task is None and self.scene is None:
             raise ValueError("task: required where there is no scene, and missing")
         if self.scene is not None and self.learning_rate is None:

@@ -61,7 +61,8 @@ def compare(
         num_samples = affordable(estimator, objective, params, timing_key, budget)
         at_a_time = max(1, min(num_repeats, _ROLLOUTS_AT_A_TIME // num_samples))
         keys = jax.random.split(repeats_key, num_repeats)
-        estimates = jax.tree.map(np.asarray, _repeat(estimator, objective, params, keys, num_samples, at_a_time))
+        found = over_keys(estimator, objective, params, keys, num_samples, at_a_time=at_a_time)
+        estimates = jax.tree.map(np.asarray, found)
         rows.append({"num_samples": num_samples, **_row(name, estimates, reference, confidence)})
     return xr.Dataset(
         {name: ("estimator", [row[name] for row in rows]) for name in rows[0]}, {"estimator": [*estimators]}
@@ -69,14 +70,16 @@ def compare(
 
 
 @eqx.filter_jit
-def _repeat(
+def over_keys(
     estimator: Estimator,
     objective: Objective,
-    params: Float[Array, " 1"],
+    params: Float[Array, " dim"],
     keys: Key[Array, " repeats"],
     num_samples: int,
-    at_a_time: int,
+    *,
+    at_a_time: int = 1,
 ) -> GradientEstimate:
+    """Return an estimate for each key, in one program; some at a time."""
     return map_in_chunks(lambda key: estimator(objective, params, key, num_samples=num_samples), keys, at_a_time)
 
 

@@ -86,14 +86,10 @@ class Quadruped(Environment):
         return (state.qpos[2] < _LOWEST) | (_in_trunk(state)[0][2] > -0.3)
 
 
-def quadruped(*, is_randomised: bool = True) -> Quadruped:
-    """Return the task on a robot of 12 kg; a time step is 4 ms, an action holds for five.
-
-    Args:
-        is_randomised: whether friction, masses and gains differ between copies, see `Environment.randomised`.
-    """
+def quadruped() -> Quadruped:
+    """Return the task on a robot of 12 kg, each copy another one; a time step is 4 ms, an action holds for five."""
     scene = load_scene(scene_path("quadruped"), timestep=0.004, max_contacts=8)
-    return Quadruped(scene, frame_skip=5, randomisation=spread if is_randomised else None)
+    return Quadruped(scene, frame_skip=5, randomisation=spread)
 
 
 def spread(key: PRNGKeyArray, scene: Scene) -> Scene:

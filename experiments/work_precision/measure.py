@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 import mjxgrad as mg
 from experiments.motion import advance
 from experiments.parallel import in_threads, num_cores
+from experiments.problems.comparison import over_keys
 from experiments.work_precision.cases import Case, case, own_case
 from experiments.work_precision.settings import Settings, Sizes
 from experiments.workspace import Workspace
@@ -501,7 +502,10 @@ def _estimate(
 ) -> tuple[float, float, float, float]:
     """Return an estimator's error, bias with its error, and variance, over the size of the right gradient."""
     size, keys = float(np.linalg.norm(right)), jax.random.split(jax.random.key(seed), _REPEATS)
-    values = np.asarray(_repeated(record, keys, function, num_samples))
+    at = jnp.zeros_like(record.stddev)
+    values = np.asarray(
+        over_keys(getattr(mg.estimators, function), record, at, keys, num_samples, at_a_time=_REPEATS).value
+    )
     # What it has in the mean, and the error of that, from all rollouts where it is linear in them.
     if function == "zeroth_order":
         centre, chance = smoothed_gradient(np.asarray(record.costs), np.asarray(record.noise), float(record.stddev[0]))
@@ -515,10 +519,3 @@ def _estimate(
         return np.inf, np.inf, chance, variance
     bias = float(np.sqrt(max(0.0, offset**2 - chance**2)))
     return float(np.hypot(bias, np.sqrt(variance))), bias, chance, variance
-
-
-@functools.partial(jax.jit, static_argnums=(2, 3))
-def _repeated(objective: Recorded, keys: Array, function: str, num_samples: int) -> Float[Array, "repeats dim"]:
-    estimator = getattr(mg.estimators, function)
-    params = jnp.zeros_like(objective.stddev)
-    return jax.vmap(lambda key: estimator(objective, params, key, num_samples=num_samples).value)(keys)

@@ -30,10 +30,10 @@ def test_the_verdict_tells_solved_from_stuck_and_hard_balls_have_a_say():
         run_of("touching", 2.3, 1.39, hard=0.005, touches=True),
     ]
     outcome = outcome_of("billiards", runs, 1.01 * hard_optimum()[0])
-    assert answer(outcome) == "1 of 3 ways find it, best “near” (1.40); not “soft alone” or “idle”."
+    assert answer(outcome) == "1 of 3 ways find it, best “near” (1.395); not “soft alone” or “idle”."
     told = verdict(outcome)
-    assert "a cost below 1.4105 is reached by “near” (1.40), also when hard balls play their forces." in told
-    assert "In between: “soft alone” (1.40); no progress: “idle” (2.00); what stays untouched costs 2." in told
+    assert "a cost below 1.4105 is reached by “near” (1.395), also when hard balls play their forces." in told
+    assert "In between: “soft alone” (1.4); no progress: “idle” (2); what stays untouched costs 2." in told
     assert "From a start that touches: “touching” (1.39): solved." in told
     assert "zero, exactly" in findings(outcome)[0]
 
@@ -51,5 +51,5 @@ def test_a_cost_counts_from_where_on_it_stays_below():
 
 
 def test_methods_of_one_label_are_refused():
-    with pytest.raises(ValueError, match="must differ"):
+    with pytest.raises(ValueError, match="must differ, got same more than once"):
         outcome_of("rolling_pin", 2 * [run_of("same", 1)], 0.1)

@@ -25,7 +25,8 @@ def frozen():
     return _Frozen(learning.Learned(learner.policy, {}, learner), task, settings)
 
 
-@pytest.mark.parametrize("kinds", [("own",), pytest.param(("slope", "onset"), marks=pytest.mark.slow)], ids="-".join)
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", [("own",), ("slope", "onset")], ids="-".join)
 def test_the_slope_along_the_mean_gradient_of_a_smooth_return_is_its_norm(frozen, kinds, monkeypatch):
     """With λ = 1, a window as long as the return and the same noise, per unit of change of the actions."""
     monkeypatch.setattr("experiments.gradient_audit._WIDTH", 0.005)

@@ -179,7 +179,7 @@ def test_published_results_stand_beside_the_methods_that_they_are_of():
     ("change", "words"),
     [
         ({"methods": [{"name": "first_order", "rule": "concavity"}, {"name": "mppi"}]}, "first_order takes no rule"),
-        ({"methods": [{"name": "mppi"}, {"name": "mppi"}]}, "methods must differ, got MPPI more than once"),
+        ({"methods": [{"name": "mppi"}, {"name": "mppi"}]}, "must differ, got MPPI more than once"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(change, words):

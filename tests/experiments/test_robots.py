@@ -45,9 +45,16 @@ _SCENES = {
         <actuator><position joint="ball" gear="1 0 0" kp="5"/><position joint="ball" gear="0 1 0" kp="5"/></actuator></mujoco>""",
 }
 
+# Whose like tests/engines steps.
+_SLOW = [
+    one for one in _SCENES if any(word in one for word in ("crank", "muscle", "implicit", "elliptic", "ball joint"))
+]
+
 
 @pytest.mark.filterwarnings("ignore::mjxgrad.scene.SceneWarning")
-@pytest.mark.parametrize("kind", _SCENES)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(one, marks=pytest.mark.slow) if one in _SLOW else one for one in _SCENES]
+)
 def test_motion_and_derivatives_are_those_of_c_mujoco(kind, tmp_path, monkeypatch):
     monkeypatch.setattr(robots, "_PHASES", (33,))  # the gripper's derivatives scatter, of any number of starts
     file = tmp_path / "scene.xml"

@@ -188,7 +188,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(finish
     assert "not a directory" in capsys.readouterr().err
 
 
-def test_a_sweep_leads_to_its_runs_and_goes_on_where_it_stopped(tmp_path, capsys):
+def test_a_sweep_leads_to_its_runs_and_goes_on_where_it_stopped(tmp_path, monkeypatch, capsys):
     (tmp_path / "both.toml").write_text(SETTINGS + "[sweep]\nseed = [0, 1]\n")
     assert run(tmp_path / "both.toml", tmp_path / "runs") == 0
     capsys.readouterr()
@@ -202,10 +202,12 @@ def test_a_sweep_leads_to_its_runs_and_goes_on_where_it_stopped(tmp_path, capsys
     cards = (tmp_path / "runs" / "index.html").read_text()
     assert re.findall(r'href="([^"]*)"', cards) == ["both-sweep/report.html"], "one card for all combinations"
     shutil.rmtree(top / "seed=1")
-    assert run(tmp_path / "both.toml", tmp_path / "runs") == 0
-    out = capsys.readouterr().out
-    assert out.count("unchanged: ") == 1
-    assert (top / "seed=1" / "report.html").is_file()
+    capsys.readouterr()
+    _raise(monkeypatch, ValueError("reached"))
+    assert run(tmp_path / "both.toml", tmp_path / "runs") == 2
+    told = capsys.readouterr()
+    assert told.out.count("unchanged: ") == 1
+    assert told.err.endswith("reached\n")
 
 
 def test_a_gallery_shows_each_result_by_its_answer_and_picture_and_names_what_it_leaves_out(copied, capsys):

@@ -54,7 +54,7 @@ def test_the_verdict_says_from_which_stiffness_on_zeroth_order_is_closer(finishe
     [
         ("stiffness=[1.0]", "soft_heaviside needs at least two values of stiffness"),
         ('problem="heaviside"', "stiffness and shown_stiffness must not be set"),
-        ('estimators=[{name="first_order"}, {name="first_order"}]', "estimators must differ, got first order more"),
+        ('estimators=[{name="first_order"}, {name="first_order"}]', "estimators: must differ, got first order more"),
         ('estimators=[{name="first_order", baselin="none"}]', 'did you mean "baseline"'),
         ('estimators=[{name="zeroth_ordr"}]', 'did you mean "zeroth_order"'),
     ],

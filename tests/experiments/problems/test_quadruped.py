@@ -14,7 +14,7 @@ from experiments.problems.quadruped import MOST_COMMAND, quadruped
 
 @pytest.fixture(scope="module")
 def robot():
-    return quadruped(is_randomised=False)
+    return dataclasses.replace(quadruped(), randomisation=None)
 
 
 def test_who_stands_still_earns_more_than_who_falls(robot):

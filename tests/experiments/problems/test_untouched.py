@@ -13,7 +13,7 @@ HORIZON = 40
 
 @pytest.fixture(scope="module")
 def stroke():
-    return billiards(num_pieces=10)
+    return billiards(num_pieces=10).with_engine("mujoco")  # which compiles in no time
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,6 @@ def test_the_best_force_played_on_hard_balls_costs_the_optimum():
     assert hard_cost(best_forces(1000)) == pytest.approx(hard_optimum()[0], abs=2e-3)
 
 
-@pytest.mark.slow
 def test_the_simulated_stroke_costs_what_hard_balls_say(differentiated):
     for forces in (best_forces(10), np.tile([3.2, 2.9], (10, 1))):
         simulated, _ = differentiated(jnp.asarray(forces.ravel()))
@@ -65,18 +64,16 @@ def test_the_simulated_stroke_costs_what_hard_balls_say(differentiated):
         assert float(simulated) == pytest.approx(hard_cost(forces), abs=0.03)
 
 
-@pytest.mark.slow
 def test_as_long_as_the_balls_do_not_touch_the_derivative_is_that_of_the_effort(stroke, differentiated):
     start = stroke.start(1.3)
     cost, gradient = differentiated(start)
     assert float(cost) == pytest.approx(2 + 0.1 * 2 * 1.3**2, rel=1e-12)
-    assert np.allclose(gradient, 2 * 0.1 * start / 10, rtol=1e-9)
+    assert np.allclose(gradient, 2 * 0.1 * start / 10, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_a_contact_that_begins_earlier_lets_the_derivative_see_the_other_ball(stroke):
     start = stroke.start(1.3)
-    gradient = jax.jit(jax.grad(lambda params, margin: stroke.seen_from_afar(0, 0, margin).cost(params)))(start, 0.3)
+    gradient = jax.jit(jax.grad(stroke.seen_from_afar(0, 0, 0.3).cost))(start)
     effort = 2 * 0.1 * start / 10
     # Pushing harder at first brings the other ball closer to the target, which is worth more than the effort.
     assert np.all(np.asarray(gradient - effort)[:4] < -0.01)
