@@ -55,7 +55,7 @@ def solved(
         sizes = np.sqrt(damping) * np.linalg.norm(factors, axis=1)
         sizes[:, -1] = 0.0
         factors = _triangle(np.concatenate([factors, sizes[:, :, None] * np.eye(sizes.shape[1])], axis=1))
-    by_start, mixed, slope, residual = split(factors, count)
+    *_, slope, residual = split(factors, count)
     lengths = np.linalg.norm(slope, axis=0)
     lengths = np.where(lengths > 1e-12 * lengths.max(initial=0.0), lengths, np.inf)  # what has no effect stays
     scaled = slope / lengths

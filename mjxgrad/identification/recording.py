@@ -96,11 +96,12 @@ class Recording:
         if not begins.size:
             raise ValueError(f"duration must be at most that of {self.name}, {times[-1]:g} s, got {duration:g} s")
         if "qvel" not in measured:
-            rows = np.arange(len(times))
-            last, first = np.minimum(rows + _AROUND, len(times) - 1), np.maximum(rows - _AROUND, 0)
-            apart = (times[last] - times[first])[:, None]
-            measured["qvel"] = (measured["qpos"][last] - measured["qpos"][first]) / apart
-            noise["qvel"] = 2 / np.median(apart) * np.broadcast_to(noise.get("qpos", 1.0), measured["qpos"].shape[1:])
+            # MuJoCo's speed of a step is that which led to its place: half a step before.
+            half = _AROUND * float(np.median(np.diff(times)))
+            first, last = (np.clip(times - timestep / 2 + way, times[0], times[-1]) for way in (-half, half))
+            places = [np.stack([np.interp(at, times, x) for x in measured["qpos"].T], axis=1) for at in (first, last)]
+            measured["qvel"] = (places[1] - places[0]) / (last - first)[:, None]
+            noise["qvel"] = 1 / half * np.broadcast_to(noise.get("qpos", 1.0), measured["qpos"].shape[1:])
         controls, at = self.controls, self.control_times
         if controls is not None and at is None:
             at = timestep * np.arange(len(controls))
