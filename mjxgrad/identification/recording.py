@@ -16,7 +16,7 @@ from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, sensor
 
 STATES = ("qpos", "qvel", "act")
-_AROUND = 4  # rows on each side that tell a speed
+_AROUND = 2  # rows on each side that tell a speed
 
 
 @dataclasses.dataclass(frozen=True)
