@@ -91,6 +91,13 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
         files.recording(scene, tmp_path / "a.npz")
 
 
+def test_an_archive_with_complex_numbers_is_refused(scene, tmp_path):
+    """One of them would else lose its imaginary part in silence."""
+    np.savez(tmp_path / "a.npz", time=np.arange(3.0), place=np.full(3, 1j))
+    with pytest.raises(ValueError, match="place must be real numbers, got complex128"):
+        files.recording(scene, tmp_path / "a.npz")
+
+
 def test_each_number_of_a_free_joint_counts_but_a_part_of_a_quaternion():
     """Motion capture of places alone: three of six changes are compared, and the fit sees them."""
     scene = mg.load_scene(
@@ -137,13 +144,20 @@ def test_the_noise_is_that_of_columns_or_whole_signals(scene, tmp_path):
 
 def test_parameters_are_named_in_a_word(scene):
     given = ["mass:cart=0.5..3", "friction:floor/ball", "damping:x", "gains:servo", "delay=0..0.1"]
-    found = named(scene, given)
+    found = named(scene, [*given, "body_pos[2]:cart=0.5..2", "jnt_stiffness:x=0..1"])
+    fields = found["body_pos[2]:cart"].write(scene.model, jnp.asarray(1.5)) | found["jnt_stiffness:x"].write(
+        scene.model, jnp.asarray(0.5)
+    )
+    np.testing.assert_allclose(fields["body_pos"][2], [2, 0, 1.5])
+    np.testing.assert_allclose(fields["jnt_stiffness"], [0, 0.5])
     assert (found["mass:cart"].nominal, found["mass:cart"].upper, found["delay"].upper) == (2.0, 3.0, 0.1)
     refused = {
         "weight:cart": "kind one of mass",
         "mass": "must say of what",
         "gear:no": "no",
         "mass:cart=-1..1": "negative",
+        "body_pos:cart": "column of body_pos must be one of",
+        "opt.timestep": "kind one of mass",
     }
     for wrong, said in refused.items():
         with pytest.raises(ValueError, match=said):

@@ -296,3 +296,30 @@ def test_a_recording_of_places_alone_is_cut_into_windows_that_start_at_their_spe
         assert np.isnan(window.measured["qvel"][1:]).all()
     result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, windows[1:], free_start=True)
     np.testing.assert_allclose(result.values["gear"], 3.0, rtol=0.02)
+
+
+def test_what_recordings_cannot_tell_is_said_before_a_search(cart):
+    """The motion shows the ratio of mass and gear alone; of the gear by itself the error is that of a regression, and a price."""
+    recording = Recording({"place": _course()}, _DRIVE[:, None], noise={"place": 1e-3})
+    gear, mass = identification.gear(cart, "motor"), identification.mass(cart, "cart")
+    both = identification.outlook(cart, {"mass": mass, "gear": gear}, [recording])
+    assert "not told: mass with gear" in both.summary()
+    assert both.rows()[1:] == [("mass", "not told", "gear"), ("gear", "not told", "mass")]
+    alone = identification.outlook(cart, {"gear": gear}, [recording])
+    error = 1e-3 / np.linalg.norm(_course(gear=1.0))
+    np.testing.assert_allclose(np.sqrt(alone.told["covariance"][0, 0]), error, rtol=0.02)
+    assert alone.num_motions > 0 < alone.seconds < 5
+
+
+@pytest.mark.parametrize(
+    ("measured", "said"),
+    [
+        ({"place": np.zeros((0, 1))}, "at least one row of some signal, got {'place': 0}"),
+        ({"place": [0.0, np.inf]}, "finite, or NaN for none, got infinity in place"),
+        ({"place": [0.0, 1.0], "qvel": [0.0]}, "same number of rows, got {'place': 2, 'qvel': 1}"),
+    ],
+)
+def test_recordings_without_rows_or_with_infinity_are_told_so(measured, said):
+    with pytest.raises(ValueError, match="of the recording must") as refused:
+        Recording(measured)
+    assert said in str(refused.value)
