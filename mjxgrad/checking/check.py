@@ -58,7 +58,7 @@ class Verdict(Paged):
     Attributes:
         name: name of the scene.
         headline: the answer, in at most 25 words.
-        findings: faults first, then measurements left out for lack of time.
+        findings: faults first, then errors and prices; at last what was left out for lack of time.
         recommendation: recommended settings.
         code: the recommended settings as code to paste.
         outcomes: names of the outcomes.
@@ -208,11 +208,12 @@ def check(
             prices = seconds_of(scene, advice.horizon)
             advice = findings.recommend(motions, stability, measured, slots, prices["slope"] / prices["discrete"])
             found.append(findings.price_finding(prices, told, advice.horizon))
+    order = {"slope": 0, "price": 1, "left_out": 3, "not_measured": 3}
     path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,
         headline=findings.headline(found, advice, motions, told, prices),
-        findings=tuple(sorted(found, key=lambda one: (not one.is_fault, one.kind not in ("not_measured", "left_out")))),
+        findings=tuple(sorted(found, key=lambda one: (not one.is_fault, order.get(one.kind, 2)))),
         recommendation=advice,
         code=_code(scene, advice, path),
         outcomes=names,

@@ -21,7 +21,7 @@ from mjxgrad.scene import Scene, SceneError, load_scene
 
 Kind = Literal[
     "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
-    "cost", "engines", "not_measured", "left_out", "slope", "order", "note",
+    "cost", "engines", "not_measured", "left_out", "slope", "price", "order", "note",
 ]  # fmt: skip
 _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
@@ -214,7 +214,7 @@ def price_finding(prices: Mapping[str, float], found: Sequence[Slope], horizon: 
     )
     if found and found[0].errors.size and slope > discrete and nearest(found, slope / discrete) == "discrete":
         text += f". The slope costs {slope / discrete:.2g} times as much and is no nearer beyond doubt"
-    return Finding("note", f"{text}.")
+    return Finding("price", f"{text}.")
 
 
 def _is_far(found: Sequence[Slope]) -> bool:

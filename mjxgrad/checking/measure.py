@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -43,17 +44,13 @@ SOFTER = 0.1
 _NUM_LINES, _NUM_TIMES = 3, 4
 _BEFORE, _AFTER = 30, 40  # steps around the first touch
 _FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 8
-_NUM_CHUNKS = (
-    8  # in which the slopes of a batch are taken, as time allows, and evenly spread: none, one, two, ... of them
-)
-_SPREAD = (0, 4, 2, 6, 1, 5, 3, 7)
-_LINE_SHARE = 0.6  # of the time that is left, for the slopes of a line
+_FEWER = 8  # times fewer motions than a batch, at most, have their slopes taken, which take most of the time
+_SHARE = 0.6  # of the time that is left, for the slopes of a line or of noise
 _SMALLEST_JUMP = 0.05  # share of the outcome's variation along the line
 _CLEAR = 0.1  # largest relative error of a usable slope
 _FEWEST_TEETH = 4
 CLOSE = 0.05
 """Largest expected error of a derivative that counts as the slope."""
-_DEARER = 1.5  # price of a slope in that of a discrete derivative, up to which it need be no nearer beyond doubt
 _AT_REST = 1e-3  # share of the largest variation at any time
 _UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
 _BESIDE = 0.05  # share of half a line beyond the jumps, where touching pairs are compared
@@ -141,9 +138,13 @@ def nearest(found: Sequence[Slope], price: int | float = np.inf) -> Kind:
     """
     slope, discrete = found
     gains = discrete.errors - slope.errors
-    is_nearer = not gains.size or gains.mean() > gains.std() / np.sqrt(gains.size)
-    is_cheap = price <= _DEARER and (not gains.size or gains.mean() > 0)
-    return "slope" if (is_nearer or is_cheap) and not discrete.error <= CLOSE else "discrete"
+    if not gains.size:
+        return "slope"
+    if discrete.error <= CLOSE or gains.mean() <= 0:
+        return "discrete"
+    # In standard errors: a slope of eight times the price must be nearer by three.
+    needed = 1.0 if not np.isfinite(price) else np.clip(np.log2(price), 0.0, 3.0)
+    return "slope" if gains.mean() > needed * gains.std() / np.sqrt(gains.size) else "discrete"
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ def _lengths(
 ) -> list[int]:
     """Choose the number of steps, by first touches and the time of steps about one, and the steps at which to look."""
     wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
-    still, size = np.zeros(motions.qvel.shape[2]), mover.size // _NUM_CHUNKS
+    still, size = np.zeros(motions.qvel.shape[2]), mover.size // _FEWER
     direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
     begin = max(0, min(begin + _BEFORE, motions.controls.shape[1]) - _TRIED_STEPS // 2)
     states = _repeated(motions.state(motion, begin), size)
@@ -297,25 +298,17 @@ class _Probe:
         growth = np.nanmedian(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
         return Line(pose, words, plain, shorter, jumps, changed, growth, own[1].num_diverged + fine.num_diverged)
 
-    def _in_time(self, move: Callable[..., Moved], values: np.ndarray, share: float = _LINE_SHARE) -> Moved:
-        """Move values of a batch in chunks as long as there is time, the first in any case; the others are NaN.
+    def _in_time(self, move: Callable[..., Moved], values: np.ndarray) -> Moved:
+        """Move as many values of a batch, evenly spread, as there is time for, an eighth at least; the others are NaN."""
+        left = _SHARE * max(self.mover.end - time.perf_counter(), 1e-9)
+        stride = math.ceil(min(_FEWER, self.mover.seconds("slope", self.lengths[-1] * len(values)) / left)) or 1
 
-        Slopes take most of the time. A few motions tell them nearly as well as all, where they scatter little.
-        """
-        until = time.perf_counter() + share * (self.mover.end - time.perf_counter())
-        chunk, whole = self.mover.seconds("slope", self.lengths[-1] * len(values)) / _NUM_CHUNKS, None
-        for number, first in enumerate(_SPREAD):
-            if number and not time.perf_counter() + chunk < until:
-                break
-            part = move(values[first::_NUM_CHUNKS])
-            if whole is None:
-                room = lambda x: np.full((len(values), *np.shape(x)[1:]), np.nan)  # noqa: E731
-                whole = Moved(room(part.outcomes), room(part.derivatives), room(part.growth), 0)
-            for name in ("outcomes", "derivatives", "growth"):
-                getattr(whole, name)[first::_NUM_CHUNKS] = getattr(part, name)
-            chunk = self.mover.seconds("slope", self.lengths[-1] * len(values)) / _NUM_CHUNKS
-        assert whole is not None
-        return whole
+        def spread(x: np.ndarray) -> np.ndarray:
+            (found := np.full((len(values), *x.shape[1:]), np.nan))[::stride] = x
+            return found
+
+        part = move(values[::stride])
+        return Moved(spread(part.outcomes), spread(part.derivatives), spread(part.growth), part.num_diverged)
 
     def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
         """Return the pairs that touch only on one side of the jumps; a glancing hit jumps once per time step."""
