@@ -11,11 +11,13 @@ while JAX differentiates: elsewhere nobody asks for them.
 import functools
 import itertools
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
@@ -27,7 +29,7 @@ from mjxgrad.engines.jacobians import with_pairs
 from mjxgrad.engines.layout import MOTION
 from mjxgrad.engines.pool import ONCE, Pool, pool_of
 from mjxgrad.engines.stepmap import PAIRS, advance, begin
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
 
@@ -215,7 +217,16 @@ def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
     def run(*given) -> dict[str, np.ndarray]:
         give_up_if_stopped()
         given = jax.tree.map(np.asarray, given)
-        return {k: np.asarray(x, shapes[k].dtype) for k, x in function(*given).items()}
+        try:
+            found = function(*given)
+        except mujoco.FatalError as error:  # of memory, as a rule; XLA would show it in a page of its own
+            reason = " ".join(str(error).split())
+            warnings.warn(f"C MuJoCo gave up, and its numbers are NaN: {reason}", SceneWarning, stacklevel=2)
+            inner = [np.ndim(x) for x in jax.tree.leaves(arguments)]
+            parts = [x.shape[: x.ndim - n] for x, n in zip(jax.tree.leaves(given), inner, strict=True)]
+            batch = np.broadcast_shapes(*parts)
+            found = {name: np.full((*batch, *shape.shape), np.nan) for name, shape in shapes.items()}
+        return {k: np.asarray(x, shapes[k].dtype) for k, x in found.items()}
 
     return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
 

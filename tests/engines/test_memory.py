@@ -1,0 +1,26 @@
+"""What C MuJoCo cannot do for want of memory is a warning, and no number."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import mjxgrad as mg
+
+BOXES = "".join(
+    f'<body pos="0 0 {0.1 + 0.19 * i}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(6)
+)
+XML = f'<mujoco><size memory="40K"/><worldbody><geom type="plane" size="1 1 1"/>{BOXES}</worldbody></mujoco>'
+
+
+def test_a_derivative_for_which_the_file_leaves_no_memory_is_no_number_and_said_in_a_sentence():
+    """Steps of this pile fit into 40 kB; the constraints that its derivatives compare do not."""
+    scene = mg.load_scene(XML, engine="mujoco")
+
+    def height(speed):
+        start = mg.initial_state(scene, qvel=speed)
+        return mg.rollout(scene, start, horizon=3, contact=mg.Slope()).qpos[-1, 2]
+
+    with pytest.warns(mg.scene.SceneWarning, match=r"C MuJoCo gave up, and its numbers are NaN: mj_stackAlloc"):
+        slopes = jax.vmap(jax.grad(height))(jnp.zeros((2, scene.model.nv)))
+    assert slopes.shape == (2, scene.model.nv)
+    assert jnp.isnan(slopes).all()
