@@ -97,8 +97,8 @@ def wrench(pose: Float[Array, " 3"], faces: tuple, stiffness: float, num_points:
         share = np.where((np.arange(count + 1) % count) == 0, 0.5, 1.0)[:, None] / count
         return (share * jax.vmap(at)(jnp.arange(count + 1) / count)).sum(axis=0)
 
-    by_edge = jax.vmap(integral, (0, 0, 0, None, None))
-    by_wall = jax.vmap(by_edge, (None, None, None, 0, 0))(corners, jnp.roll(corners, -1, axis=0), _OUTWARD, *faces)
+    by_edge, edges = jax.vmap(integral, (0, 0, 0, None, None)), (corners, jnp.roll(corners, -1, axis=0))
+    by_wall = jax.vmap(by_edge, (None, None, None, 0, 0))(*edges, jnp.asarray(_OUTWARD), *faces)
     return stiffness * _THICKNESS * jnp.einsum("e,wek->k", _LENGTHS, by_wall)
 
 
