@@ -312,26 +312,24 @@ def stage_model(cost: Cost, system: System, state: StateVector, control: Control
     """Return the expansion of the cost of a step around a state and a control."""
     n, function = system.num_changes, cost.residuals if isinstance(cost, LeastSquares) else cost.stage
     moved = lambda change: function(system, system.retract(state, change[:n]), control + change[n:])  # noqa: E731
-    return _model(moved, jnp.zeros(n + control.size, state.dtype))
+    return _model(cost, moved, jnp.zeros(n + control.size, state.dtype))
 
 
 def terminal_model(cost: Cost, system: System, state: StateVector) -> Quadratic:
     """Return the expansion of the terminal cost around the last state."""
-    function = cost.terminal_residuals if isinstance(cost, LeastSquares) else cost.terminal
-    return _model(
-        lambda change: function(system, system.retract(state, change)), jnp.zeros(system.num_changes, state.dtype)
-    )
+    function, n = cost.terminal_residuals if isinstance(cost, LeastSquares) else cost.terminal, system.num_changes
+    return _model(cost, lambda change: function(system, system.retract(state, change)), jnp.zeros(n, state.dtype))
 
 
-def _model(function: Callable[[Array], Array], at: Float[Array, " both"]) -> Quadratic:
+def _model(cost: Cost, function: Callable[[Array], Array], at: Float[Array, " both"]) -> Quadratic:
     """Return the expansion of a number or, by Gauss and Newton, of residuals.
 
     Negative curvature is removed, which would turn descent into ascent.
     """
-    if len(shape := jax.eval_shape(function, at).shape) == 1:
+    if isinstance(cost, LeastSquares):
         value, jacobian = function(at), jax.jacfwd(function)(at)
         return Quadratic(jacobian.T @ value, jacobian.T @ jacobian)
-    if shape:
+    if shape := jax.eval_shape(function, at).shape:
         raise ValueError(f"stage and terminal of a cost must return one number each, got shape {shape}")
     hessian = jax.hessian(function)(at)
     values, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
