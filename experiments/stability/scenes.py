@@ -67,7 +67,7 @@ def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData,
         impedances[:, :3] = solimp
     model.geom_friction[:] = point["friction"] * np.array([1.0, 0.1 * RADIUS, 0.01 * RADIUS])
     # Margins of two geoms add.
-    model.geom_margin[:] = point["margin"] / 2
+    model.geom_margin[:], model.body_margin[:] = point["margin"] / 2, point["margin"] / 2
     masses = np.array(scene.masses(point["mass_ratio"]))
     model.body_inertia[1:] *= (masses / model.body_mass[1:])[:, None]
     model.body_mass[1:] = masses

@@ -72,6 +72,7 @@ _LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT.value, mujoco.mjtConstraint.
 
 _Rows = Float[np.ndarray, "rows nv"]
 _PerRow = Float[np.ndarray, " rows"]
+_PerDof = Float[np.ndarray, " nv"]
 _Mask = Bool[np.ndarray, " rows"]
 
 
@@ -122,7 +123,7 @@ class Near:
     is_undecided: bool
     rows: Float[np.ndarray, "others nv"]
     gaps: Float[np.ndarray, " others"]
-    lengths: Float[np.ndarray, " nv"]
+    lengths: _PerDof
 
     @property
     def is_rough(self) -> bool:
@@ -159,12 +160,12 @@ class Surfaces:
         self.contact_reach, self.limit_reach = self._reach(np.max(np.abs(speeds), axis=0, initial=0.0))
         _widen(self.model, self.plain, self.contact_reach, self.limit_reach)
 
-    def _reach(self, speed: Float[np.ndarray, " nv"]) -> tuple[float, float]:
+    def _reach(self, speed: _PerDof) -> tuple[float, float]:
         """Return how far contacts and limits travel in half a step at most."""
         travel, least = (0.5 * self.timestep + 2 * self.lead) * speed, slope.LEAST_WIDTH * slope.USUAL_WIDTH
         return float(np.sort(self.levers @ travel)[-2:].sum()) + least, float(travel.sum() * self.longest) + least
 
-    def beside(self, change: float, data: mujoco.MjData) -> tuple[Float[np.ndarray, " nv"] | None, bool]:
+    def beside(self, change: float, data: mujoco.MjData) -> tuple[_PerDof | None, bool]:
         """Return the displacement after which changes of this size cross no surface, or None, and whether rounding decides."""
         mujoco.mj_fwdPosition(self.model, data)
         # Most positions are far from all, which these few operations tell.
@@ -177,13 +178,7 @@ class Surfaces:
         is_undecided = bool((jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)).any())
         return (clearance(change, rows[near], gaps[near], 0.0) if near.any() else None), is_undecided
 
-    def near(
-        self,
-        data: mujoco.MjData,
-        before: Float[np.ndarray, " nv"],
-        after: Float[np.ndarray, " nv"],
-        free: Float[np.ndarray, " nv"],
-    ) -> "Near | None":
+    def near(self, data: mujoco.MjData, before: _PerDof, after: _PerDof, free: _PerDof) -> "Near | None":
         """Return what is near the position in `data`, moving as before and after the step; None if nothing is."""
         mujoco.mj_fwdPosition(self.model, data)
         if not data.nefc:
@@ -265,27 +260,17 @@ class Surfaces:
         rows = np.concatenate([0.5 * (jacobian[first] + jacobian[other]), jacobian[limits]])
         is_rough = np.zeros(len(rows), bool)
         is_rough[: len(first)] = self.is_rough[np.asarray(contact.geom).reshape(-1, 2)[acts]].any(axis=1)
-        return (
-            is_rough,
-            rows,
-            self._gaps_at(data, first, limits),
-            slope.LEAST_WIDTH * width,
-            first_impedance > slope.NO_JUMP,
-        )
+        gaps, jumps = self._gaps_at(data, first, limits), first_impedance > slope.NO_JUMP
+        return is_rough, rows, gaps, slope.LEAST_WIDTH * width, jumps
 
 
-def kept_by_damping(model: mujoco.MjModel) -> Float[np.ndarray, " nv"]:
+def kept_by_damping(model: mujoco.MjModel) -> _PerDof:
     """Return how much of each velocity damping leaves after a step."""
     return 1 / (1 + model.opt.timestep * model.dof_damping * model.dof_invweight0)
 
 
-def widened(model: mujoco.MjModel, contact: float, limit: float) -> mujoco.MjModel:
-    """Return a copy whose contacts and limits act at gaps larger by so much (m; m or rad)."""
-    _widen(far := copy.deepcopy(model), model, contact, limit)
-    return far
-
-
 def _widen(far: mujoco.MjModel, model: mujoco.MjModel, contact: float, limit: float) -> None:
+    """Let contacts and limits act at gaps larger by so much (m; m or rad)."""
     far.geom_margin[:] = model.geom_margin + contact / 2
     far.body_margin[:] = model.body_margin + contact / 2  # else bodies of several geoms are searched as before
     far.flex_margin[:] = model.flex_margin + contact / 2
@@ -297,12 +282,15 @@ def _widen(far: mujoco.MjModel, model: mujoco.MjModel, contact: float, limit: fl
 
 def undecided(model: mujoco.MjModel) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """Return copies in which gaps of the size of rounding are closed, and open."""
-    return widened(model, 2 * _ROUNDING, 2 * _ROUNDING), widened(model, -2 * _ROUNDING, -2 * _ROUNDING)
+    both = copy.deepcopy(model), copy.deepcopy(model)
+    for other, more in zip(both, (2 * _ROUNDING, -2 * _ROUNDING), strict=True):
+        _widen(other, model, more, more)
+    return both
 
 
 def clearance(
     change: float, surfaces: Float[np.ndarray, "events nv"], gaps: _PerRow, centres: _PerRow | float
-) -> Float[np.ndarray, " nv"]:
+) -> _PerDof:
     """Return the smallest displacement after which changes of this size cross none of these surfaces."""
     least, off = 4 * change * np.abs(surfaces).max(axis=1), gaps
     if np.any(centres):
@@ -338,7 +326,7 @@ def _by_modes(
     times: _PerRow,
     chosen: _Mask,
     is_contact: _Mask,
-    lengths: Float[np.ndarray, " nv"],
+    lengths: _PerDof,
 ) -> Events | None:
     """Return the chosen rows as events, with displacements that change one mode each and carry no other row across zero."""
     scaled, index = rows / lengths, np.flatnonzero(chosen)
@@ -370,19 +358,9 @@ def _by_modes(
         if not crossed.size:
             break
         held = np.concatenate([held, crossed])
-    by_coordinate = 1 / lengths[:, None]
-    return Events(
-        mode * lengths,
-        (weights * times[index]) @ rows[index],
-        moves * by_coordinate,
-        middles * by_coordinate,
-        width,
-        rows[index],
-        gaps[index],
-        centres[index],
-        weights,
-        index,
-    )
+    ahead, own = (weights * times[index]) @ rows[index], (rows[index], gaps[index], centres[index])
+    moves, middles = moves / lengths[:, None], middles / lengths[:, None]
+    return Events(mode * lengths, ahead, moves, middles, width, *own, weights, index)
 
 
 def _connected(moved: Bool[np.ndarray, "rows nv"]) -> Int[np.ndarray, " rows"]:

@@ -13,7 +13,8 @@ A is the derivative along the motion without events, F what each event that begi
 - **Let go.** Once explained, it is let go if it is at most ten times as far apart as at first; or, at an event, if it is less far
   apart than the event's own window. That event then has a better mean of its phases than two motions have. Motions that are
   farther apart span many phases of the next event, where a derivative multiplies. After a hundred steps all are let go.
-- **Slots.** A motion has room for a number of pairs; where it lacks, the pair that is least apart is let go.
+- **Slots.** Where a motion has no more room for pairs, explained ones are let go, and then events begin none but are those of a
+  discrete gradient. A jump that is let go unexplained is multiplied by what follows: a hopping sledge's to 4000 times the slope.
 
 A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
 a difference of two motions is not.
@@ -50,9 +51,19 @@ class Begun:
     ends: Float[np.ndarray, "modes 2 motion"]
     widths: Float[np.ndarray, " modes"]
     apart: Float[np.ndarray, "modes size"]
-    lost: Float[np.ndarray, "size modes"] | None = None
+    lost: Float[np.ndarray, "size modes"]
     longest: int = slope.LONGEST
     by_others: dict[str, Float[np.ndarray, "modes entries"]] = field(default_factory=dict)
+
+    def parted(self, count: int) -> tuple["Begun", "Begun"]:
+        """Return the first ones, and the others."""
+
+        def of(part: slice) -> "Begun":
+            arrays = {name: getattr(self, name)[part] for name in ("felt", "ends", "widths", "apart")}
+            others = {name: share[part] for name, share in self.by_others.items()}
+            return Begun(**arrays, lost=self.lost[:, part], longest=self.longest, by_others=others)
+
+        return of(slice(count)), of(slice(count, None))
 
 
 @dataclass
@@ -105,7 +116,7 @@ class Course:
 
     rows: Float[np.ndarray, "motions steps size"]
     matrices: Float[np.ndarray, "motions steps changes changes"]
-    begun: Mapping[tuple[int, int], Begun]
+    begun: dict[tuple[int, int], Begun]
     models: Callable[[int, int], mujoco.MjModel]
     is_finite: Bool[np.ndarray, "motions steps"]
 
@@ -149,12 +160,16 @@ def fly(
                     live[motion] &= ~(near & (reach <= one.widths[:, None]).all(axis=0))
         slots = {}
         for motion in starting:
-            count, free = len(course.begun[motion, t].widths), np.flatnonzero(~live[motion])
-            if len(free) < count:
-                held = np.flatnonzero(live[motion])
+            one, free = course.begun[motion, t], np.flatnonzero(~live[motion])
+            if len(free) < (count := len(one.widths)):
+                held = np.flatnonzero(live[motion] & (flight.alike[motion] >= slope.NUM_ALIKE))
                 order = np.argsort(np.linalg.norm(scale * flight.apart[motion, held], axis=-1))
                 free = np.concatenate([free, held[order[: count - len(free)]]])
                 live[motion, free] = False
+                course.begun[motion, t], missed = one.parted(len(free))
+                course.matrices[motion, t] += missed.lost @ missed.felt
+                for name, share in missed.by_others.items():
+                    found[name][motion, t] += missed.lost @ share
             slots[motion] = free[:count]
         if t:
             found["stays"][:, t - 1] = live
@@ -164,14 +179,13 @@ def fly(
         if live.any():
             _advance(flight, live, course, t, layout, scale, step)
         for motion, chosen in slots.items():
-            one = course.begun[motion, t]
-            count = len(chosen)
-            flight.ends[motion, chosen], flight.widths[motion, chosen] = one.ends[:count], one.widths[:count]
+            one, count = course.begun[motion, t], len(chosen)
+            flight.ends[motion, chosen], flight.widths[motion, chosen] = one.ends, one.widths
             flight.left[motion, chosen], flight.alike[motion, chosen] = one.longest - 1, 0
-            flight.apart[motion, chosen] = one.apart[:count]
-            found["slot"][motion, t, :count], found["felt"][motion, t, :count] = chosen, one.felt[:count]
+            flight.apart[motion, chosen] = one.apart
+            found["slot"][motion, t, :count], found["felt"][motion, t, :count] = chosen, one.felt
             for name, share in one.by_others.items():
-                found[f"felt {name}"][motion, t, :count] = share[:count]
+                found[f"felt {name}"][motion, t, :count] = share
         found["apart"][:, t] = np.swapaxes(np.where(flight.widths[..., None] > 0, flight.apart, 0.0), -1, -2)
     found["stays"][:, -1] = flight.widths > 0
 
@@ -198,11 +212,10 @@ def _advance(
             own = slice(begin, end)
             felt, left = before[own] @ one.felt.T, apart[own] - expected[own]
             off[own] = np.linalg.norm(scale * (left - felt @ one.apart), axis=-1)
-            if one.lost is not None:
-                reach = np.abs(felt) * flight.widths[motions[own], slots[own]][:, None]
-                beside = np.linalg.norm(scale * (left - felt @ one.lost.T), axis=-1)
-                is_beside = (reach <= slope.BESIDE * one.widths).all(axis=1)
-                off[own] = np.where(is_beside, np.minimum(off[own], beside), off[own])
+            reach = np.abs(felt) * flight.widths[motions[own], slots[own]][:, None]
+            beside = np.linalg.norm(scale * (left - felt @ one.lost.T), axis=-1)
+            is_beside = (reach <= slope.BESIDE * one.widths).all(axis=1)
+            off[own] = np.where(is_beside, np.minimum(off[own], beside), off[own])
     is_sound = np.isfinite(apart).all(axis=-1) & course.is_finite[motions, t]
     known = off <= slope.ALIKE * np.linalg.norm(scale * apart, axis=-1)
     flight.alike[motions, slots] = np.where(known, flight.alike[motions, slots] + 1, 0)

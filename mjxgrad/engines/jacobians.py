@@ -303,7 +303,7 @@ class Worker:
         ends = self._steps(one.by, starts)
         felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, layout.num_rest)))
         apart = layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]
-        begun = Begun(felt, ends[..., layout.motion], 2 * widths, apart)
+        begun = Begun(felt, ends[..., layout.motion], 2 * widths, apart, np.zeros_like(apart).T)
         begun.longest = slope.LONGEST_OF_STAGES if self.surfaces.lead else slope.LONGEST
         return begun
 

@@ -18,6 +18,9 @@ def with_numbers(mj_model: mujoco.MjModel, numbers: Mapping[str, Any]) -> mujoco
         _copy_into(target.opt if is_option else target, name.removeprefix("opt."), np.asarray(value))
     if any(not np.array_equal(getattr(target, name), getattr(mj_model, name)) for name in _PLACES):
         _enclose(target)
+    if not np.array_equal(target.geom_margin, mj_model.geom_margin):
+        target.body_margin[:] = 0.0  # by the largest of its geoms' C MuJoCo rejects bodies of several
+        np.maximum.at(target.body_margin, target.geom_bodyid, target.geom_margin)
     return target
 
 

@@ -124,6 +124,7 @@ def _undecided(model: mujoco.MjModel) -> list[str]:
     """Name what touches or not by rounding alone: in the reference pose the gap is zero, and no coordinate moves it."""
     found, far = dict[str, None](), copy.deepcopy(model)
     far.geom_margin[:] += _NEAR
+    far.body_margin[:] += _NEAR
     far.pair_margin[:] += 2 * _NEAR
     data, rates = mujoco.MjData(far), np.zeros((2, 3, model.nv))
     mujoco.mj_fwdPosition(far, data)

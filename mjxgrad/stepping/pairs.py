@@ -16,7 +16,7 @@ the rule; the motions of pairs are stepped, not differentiated. Where nothing is
 - A, along the motion, is one linear program; small differences of steps tell whether it explains a pair.
 - Contacts and limits near their surface count in the order of their distance, as many as there are slots.
 - A change of the model (a radius, a range) moves gaps, and L has the derivative of these.
-- A pair that lacks a slot takes that of the pair which is least apart.
+- A pair takes a free slot, or that of one that is explained. Without, A serves its event, as if it were none.
 """
 
 import math
@@ -268,7 +268,7 @@ class _Step:
         modes = lambda near, lengths: self._by_modes(near, rows.is_contact, lengths)  # noqa: E731
         events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), flight.lengths)
         events = jax.tree.map(lambda x: x[0], events)
-        plan, reach = self._plan(events)
+        events, plan, reach = self._plan(events)
         felt = flight.apart @ self._felt(events).T  # slots modes
         rest = flight.apart.at[:, : self.nv].add(-felt @ events.moves.T)
         ends, widths, apart, expected = self._go_on(events, plan, jnp.stack([flight.apart, rest], axis=1), taken(moved))
@@ -304,8 +304,7 @@ class _Step:
         kept = 1 / (1 + h * model.dof_damping * model.dof_invweight0)
         fall = h**2 * jnp.abs(rows @ (kept * every.acceleration))
         width = jnp.where(solimp[:, 2] > 0, jnp.minimum(solimp[:, 2], slope.USUAL_WIDTH), slope.USUAL_WIDTH)
-        smallest = slope.SMALLEST * (1.0 if self.dtype == jnp.float64 else _COARSER)
-        least = jnp.maximum(jnp.minimum(fall, slope.STIRRED * h * speed), smallest)
+        least = jnp.maximum(jnp.minimum(fall, slope.STIRRED * h * speed), slope.SMALLEST)
         widths = jnp.maximum(widths, jnp.minimum(slope.LEAST_WIDTH * width, least))
         jumps = (solimp[:, 0] > slope.NO_JUMP) & (
             jnp.sum((rows / self.flight.lengths) ** 2, axis=1) > 1 / slope.FARTHEST**2
@@ -314,6 +313,8 @@ class _Step:
         is_near = jnp.where(every.is_blind, (gaps < 0) & (gaps > -2 * widths), jnp.abs(gaps - centres) < widths)
         is_met = jnp.abs(gaps) < h * jnp.abs(rate)
         times = -jnp.where(is_met, gaps, 0.0) / jnp.where(is_met, rate, 1.0)
+        if self.dtype != jnp.float64:  # pairs are farther apart, but what rests beside the window is no event
+            widths = jnp.maximum(widths, _COARSER * slope.SMALLEST)
         return _Near(rows, gaps, centres, widths, times, is_near & jumps)
 
     def _by_modes(self, near: _Near, is_contact: tuple[bool, ...], lengths: _Vector) -> _Events:
@@ -387,11 +388,10 @@ class _Step:
         return moves
 
     def _felt(self, events: _Events) -> Float[Array, "modes size"]:
-        rest = jnp.zeros((len(events.rows), self.size - 2 * self.nv), self.dtype)
-        return jnp.concatenate([events.rows, events.ahead, rest], axis=1)
+        return jnp.pad(jnp.hstack([events.rows, events.ahead]), ((0, 0), (0, self.size - 2 * self.nv)))
 
-    def _plan(self, events: _Events) -> tuple[_Plan, Float[Array, "modes slots"]]:
-        """Return who goes on and who begins, and how far apart at each event pairs are."""
+    def _plan(self, events: _Events) -> tuple[_Events, _Plan, Float[Array, "modes slots"]]:
+        """Return the events that have a slot, who goes on and who begins, and how far apart at each event pairs are."""
         flight, is_one = self.flight, events.is_one
         far = self._scaled(flight.apart)
         is_known = flight.alike >= slope.NUM_ALIKE
@@ -399,11 +399,14 @@ class _Step:
         reach = jnp.abs(self._felt(events) @ flight.apart.T) * flight.widths
         is_within = jnp.all(~is_one[:, None] | (reach <= 2 * events.widths[:, None]), axis=0) & jnp.any(is_one)
         goes_on &= ~(is_known & is_within)
-        order = jnp.argsort(jnp.where(goes_on, far, -1.0))[: len(is_one)]
-        place = order[jnp.maximum(jnp.cumsum(is_one) - 1, 0)]
-        places = (place == jnp.arange(len(far))[:, None]) & is_one
+        # What is not explained keeps its slot: let go, its jump would be multiplied at each event that follows.
+        order = jnp.argsort(jnp.where(goes_on, jnp.where(is_known, far, jnp.inf), -1.0))
+        rank = jnp.cumsum(is_one) - 1
+        is_one &= rank < jnp.sum(~goes_on | is_known)
+        events = events._replace(is_one=is_one, moves=jnp.where(is_one, events.moves, 0.0))
+        places = (order[jnp.clip(rank, 0, len(far) - 1)] == jnp.arange(len(far))[:, None]) & is_one
         begins = jnp.any(places, axis=1)
-        return _Plan(goes_on & ~begins, begins, places.astype(self.dtype)), reach
+        return events, _Plan(goes_on & ~begins, begins, places.astype(self.dtype)), reach
 
     def _go_on(
         self, events: _Events, plan: _Plan, changes: Float[Array, "slots 2 size"], moved: Motion

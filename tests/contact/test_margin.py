@@ -149,3 +149,14 @@ def test_bodies_that_would_hover_are_warned_about_by_name(pyramids):
 @pytest.mark.filterwarnings("error")
 def test_a_kept_height_needs_no_warning(pyramids):
     pyramids.with_softness(_with(SOFT, margin=0.005, rest_acceleration=GRAVITY))
+
+
+def test_bodies_of_several_geoms_keep_a_margin_by_c_mujoco():
+    """It rejects them by a margin of their own. The same written in the file is the same motion."""
+    text = """<mujoco><default><geom margin="{}"/></default><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .13">
+        <freejoint/><geom size=".1" pos=".2 0 0"/><geom size=".1" pos="-.2 0 0"/></body></worldbody></mujoco>"""
+    given = load_scene(text.format(0), engine="mujoco", softness=Softness(margin=0.02))
+    written = load_scene(text.format(0.01), engine="mujoco")
+    one, other = (mg.rollout(scene, mg.initial_state(scene), horizon=100).qpos[-1, 2] for scene in (given, written))
+    np.testing.assert_allclose(one, other, atol=1e-9)
+    assert other > 0.11

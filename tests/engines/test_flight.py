@@ -13,7 +13,7 @@ MODEL = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody></mujoco>"
 )
 LAYOUT = Layout(MODEL)
-WIDTH = 2.0
+WIDTH, NOTHING = 2.0, np.zeros((2, 1))
 
 
 def _nothing():
@@ -25,15 +25,16 @@ def _nothing():
 def _flown(matrices, begun, factors):
     """Return what is found of a motion at rest, whose pairs are `factors` times as far apart after each step."""
     steps, slots = len(matrices), flights.NUM_SLOTS
-    rows = np.zeros((1, steps, LAYOUT.size))
+    rows, state = np.zeros((1, steps, LAYOUT.size)), np.array(matrices, float)[None]
     course = Course(
         rows,
-        np.array(matrices, float)[None],
+        state,
         {(0, t): one for t, one in begun.items()},
         lambda *_: MODEL,
         np.ones((1, steps), bool),
     )
     shapes = {"felt": (steps, 1, 2), "slot": (steps, 1), "apart": (steps, 2, slots), "stays": (steps, slots)}
+    shapes |= {"size": (steps, 2, 2), "felt size": (steps, 1, 2)}
     found = {
         name: np.zeros((1, *shape)) for name, shape in {**shapes, "before": (2, slots), "enters": (slots,)}.items()
     }
@@ -46,13 +47,13 @@ def _flown(matrices, begun, factors):
 
     pairs = _nothing()
     fly(pairs, course, LAYOUT, np.ones(1), 0.1, step, found)
-    return {name: value[0] for name, value in found.items()}
+    return {name: value[0] for name, value in found.items()} | {"state": state[0]}
 
 
 def _begun(apart, felt=(1.0, 0.0), **more):
     apart = np.array([apart], float)
     ends = np.stack([apart, -apart], axis=1) * WIDTH / 2
-    return Begun(np.array([felt]), ends, np.array([WIDTH]), apart, **more)
+    return Begun(np.array([felt]), ends, np.array([WIDTH]), apart, NOTHING, **more)
 
 
 def _lasted(found):
@@ -83,7 +84,7 @@ def test_a_pair_whose_derivative_never_explains_it_is_let_go():
 def test_an_event_lets_go_what_is_less_apart_than_its_window():
     """Known but far apart, 11 over 2 m: an event in 4 whose window is 30 m wide takes it, one of 20 m does not."""
     for width, lasts in ((30.0, 4), (20.0, 9)):
-        event = Begun(np.array([[1.0, 0.0]]), np.zeros((1, 2, 2)), np.array([width]), np.zeros((1, 2)))
+        event = Begun(np.array([[1.0, 0.0]]), np.zeros((1, 2, 2)), np.array([width]), np.zeros((1, 2)), NOTHING)
         found = _flown([np.eye(2)] * 8, {0: _begun([11.0, 0.0]), 4: event}, [1.0] * 8)
         assert _lasted(found) == lasts
 
@@ -116,11 +117,21 @@ def test_what_pairs_add_is_the_sum_of_their_differences():
     np.testing.assert_allclose(ours, total, rtol=1e-12)
 
 
-def test_where_slots_lack_the_pair_that_is_least_apart_is_let_go(monkeypatch):
+def test_where_slots_lack_explained_pairs_make_room_and_other_events_are_those_of_a_discrete_gradient(monkeypatch):
+    """By step 4 the pair in the only slot is explained, and far apart."""
     monkeypatch.setattr(flights, "NUM_SLOTS", 1)
-    found = _flown([np.eye(2)] * 3, {0: _begun([1.0, 0.0]), 1: _begun([3.0, 0.0])}, [3.0] * 3)
-    assert found["stays"][0].sum() == 0  # one slot, taken by the second
-    assert found["apart"][1].sum() == 3.0
+    lost, far = np.array([[2.0, 3.0], [0.0, 0.0]]), [[11.0, 0.0], [11.0, 0.0]]
+    felt = np.array([[0.0, 1.0], [0.0, 4.0]])
+    two = Begun(felt, np.zeros((2, 2, 2)), np.full(2, WIDTH), np.array(far), lost, by_others={"size": np.eye(2)})
+    one = two.parted(1)[0]
+    found = _flown([np.eye(2)] * 6, {0: _begun(far[0]), 1: one, 4: two}, [1.0] * 5)
+    begins = np.abs(found["felt"]).sum(axis=(1, 2))
+    np.testing.assert_array_equal(begins > 0, [True, False, False, False, True, False])
+    # The second event of step 4, and that of step 1, are left to small differences: `lost felt` is theirs.
+    np.testing.assert_array_equal(found["state"][1], [[1.0, 2.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(found["state"][4], [[1.0, 12.0], [0.0, 1.0]])
+    np.testing.assert_array_equal(found["size"][4], [[0.0, 3.0], [0.0, 0.0]])
+    np.testing.assert_array_equal(found["felt size"][4], [[1.0, 0.0]])
 
 
 def test_a_flight_is_its_numbers():
