@@ -94,8 +94,10 @@ class Motions:
         """Return the signals of the same simulations, at the scene's own steps."""
         controls = np.broadcast_to(windows.controls[:, :steps], (len(values), *windows.controls[:, :steps].shape))
         if self._delay is not None:
-            delays = np.stack([np.ravel(self.coordinates.unravel(v)[self._delay])[0] for v in values])
-            controls = _later(controls, delays / float(self.scene.model.opt.timestep))
+            at = float(self.scene.model.opt.timestep) * np.arange(controls.shape[2])
+            delays = [float(np.ravel(self.coordinates.unravel(one)[self._delay])[0]) for one in values]
+            interp = np.vectorize(lambda late, u: np.interp(at - late, at, u), signature="(),(n)->(n)")
+            controls = np.moveaxis(interp(np.array(delays)[:, None, None], np.moveaxis(controls, 2, 3)), 3, 2)
         if not self._engine.compiles:
             return self._by_mujoco(windows, values, starts, controls)
         dtype, count = self.scene.data.qpos.dtype, len(values)
@@ -193,13 +195,3 @@ class Motions:
 
             self._programs[key] = compile_once(jax.jit(program).lower(leaves, *arguments))
         return self._programs[key](leaves, *arguments)
-
-
-def _later(controls: np.ndarray, late: np.ndarray) -> np.ndarray:
-    """Return controls, linear between the steps, that come so many steps later."""
-    at, found = np.arange(controls.shape[2]), np.empty(controls.shape)
-    for i, place in enumerate(at - late[:, None]):
-        below = np.clip(np.floor(place), 0, len(at) - 1).astype(int)
-        share = np.clip(place - below, 0.0, 1.0)[:, None]
-        found[i] = controls[i][:, below] * (1 - share) + controls[i][:, np.minimum(below + 1, len(at) - 1)] * share
-    return found
