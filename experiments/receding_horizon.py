@@ -1,13 +1,17 @@
 """How often a robot can be planned for: `make rates`.
 
-Each robot is to stay at its first pose. `planning.Controller` takes one iteration in each decision, by MJX and by C MuJoCo, whose
-derivatives take all cores. Beside it is a plain iLQR on `mjd_transitionFD` in NumPy, of the same cost, horizon and step lengths.
+An arm of eight joints pushes a box to a goal 16 cm away. Other robots are to stay at their first pose: `planning.Controller`
+takes one iteration in each decision, by MJX and by C MuJoCo, whose derivatives take all cores. Beside it is a plain iLQR on
+`mjd_transitionFD` in NumPy, of the same cost, horizon and step lengths.
 """
 
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -26,11 +30,59 @@ _ROBOTS = {
 }
 _SPEED, _TERMINAL, _CONTROL = 0.01, 10.0, 0.01  # weights of speeds, of the end, and of controls; of positions it is 1
 _LENGTHS = (1.0, 0.6, 0.3, 0.1, 0.03)
+_ARM, _HELD, _NODES, _DECISIONS, _NEAR = Path(__file__).parent / "problems" / "arm_and_box.xml", 20, 10, 125, 0.02
+
+
+class Push(planning.LeastSquares):
+    """The box is to be at its goal, and the tip behind the box."""
+
+    goal: jax.Array
+    home: jax.Array
+    tip: int = eqx.field(static=True)
+
+    def terminal_residuals(self, system, state):
+        return 3 * self._places(system, state)
+
+    def residuals(self, system, state, control):
+        return jnp.concatenate([self._places(system, state), 0.045 * (control - self.home), 0.05 * state[15:23]])
+
+    def _places(self, system: planning.System, state: jax.Array) -> jax.Array:
+        assert isinstance(system, planning.SceneSystem)
+        tip, away = system.placed(state).site_xpos[self.tip], self.goal - state[8:10]
+        far = jnp.sqrt(away @ away + 1e-3)
+        behind = jnp.append(state[8:10] - 0.07 * away / far, 0.04)
+        # At the goal there is nothing left to push.
+        nearness = jnp.sqrt(0.2 + 0.8 * far / (far + 0.02)) * (tip - behind)
+        return jnp.concatenate([5 * away, nearness, 0.2 * state[23:25]])
+
+
+def push(*, starts: int = 10, deadline: float | None = 0.04) -> None:
+    """Push a box from several starts, in C MuJoCo."""
+    model, rng = mujoco.MjModel.from_xml_path(str(_ARM)), np.random.default_rng(0)
+    goal, home = model.site("goal").pos[:2], model.key_ctrl[0]
+    system = planning.SceneSystem(scene=mg.load_scene(model, engine="mujoco"), num_substeps=_HELD)  # pyright: ignore
+    cost = Push(goal=jnp.asarray(goal), home=jnp.asarray(home), tip=model.site("tcp").id)
+    controller = planning.Controller(system, cost, np.tile(home, (_NODES, 1)), num_samples=8, deadline=deadline)
+    print(controller)
+    for _ in range(starts):
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        place = rng.uniform([0.56, -0.1, -0.5], [0.66, 0.1, 0.5])
+        data.qpos[8:10], turn = place[:2], place[2]
+        data.qpos[11:15] = np.cos(turn / 2), 0, 0, np.sin(turn / 2)
+        controller.reset()
+        for _ in range(_DECISIONS):
+            data.ctrl[:] = controller(data)
+            mujoco.mj_step(model, data, _HELD)
+        off = np.linalg.norm(data.qpos[8:10] - goal)
+        told = "there" if off < _NEAR else "not there"
+        print(f"{told}, {1e3 * off:.0f} mm off; {str(controller).split('. ')[0]}", flush=True)
 
 
 def rates(*, decisions: int = 50) -> None:
-    """Measure the rate of decisions: ours on both engines, and a plain iLQR's."""
+    """Measure the rate of decisions: an arm's; ours on both engines, and a plain iLQR's."""
     mg.keep_compiled()
+    push()
     announce(f"{decisions} decisions of one iteration, float32")
     for name, (path, timestep, num_substeps, horizon) in _ROBOTS.items():
         model = mujoco.MjModel.from_xml_path(str(path))

@@ -24,6 +24,7 @@ from mjxgrad.rollouts import State
 PARTS: tuple[str, ...] = ("linear models", "backward pass", "rollouts")
 """Of an iteration, in their order."""
 _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first plan has
+_LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
 _FADING = 0.8  # of what a part is expected to take, if it took less
 
 
@@ -149,7 +150,7 @@ class Controller(Printed):
             state: the present state: a vector of the system, or for a scene its `State` or C MuJoCo's data.
 
         Warns:
-            UserWarning: in the first decision, if no control moves what has a cost.
+            UserWarning: in the first decision, if no control moves something that has a cost, and the cost hardly falls.
 
         Raises:
             ValueError: if the state has another size than the system's, or is not finite.
@@ -157,6 +158,7 @@ class Controller(Printed):
         start, is_first, began = self._vector(state), not self.seconds, time.perf_counter()
         limit = np.inf if self.deadline is None or is_first or not self.price else self.deadline
         self._begin(start, is_first)
+        given = self.plan.cost
         factors = self._schedules[0 if is_first else 1]
         turns = [(*both, part) for both in itertools.pairwise([*factors, factors[-1]]) for part in PARTS][self._next :]
         for number, (factor, following, part) in enumerate(turns):
@@ -169,7 +171,7 @@ class Controller(Printed):
             self._advance(part, factor, following)
         self.seconds.append(time.perf_counter() - began)
         self.num_missed += self.seconds[-1] > limit
-        if is_first and self._search.unmoved.any() and self.price:
+        if is_first and self._search.unmoved.any() and self.price and not self.plan.cost < _LITTLE * given:
             warnings.warn(self._untouched(), stacklevel=2)
         return np.array(self.plan.controls)[0]
 
