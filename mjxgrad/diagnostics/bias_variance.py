@@ -352,41 +352,34 @@ def bias_variance(
     is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1 and reference is None
     plan = Plan(num_samples, with_zero_noise=not is_line, **wanted)
     units = _rounds(plan)
-    part = functools.partial(_sampled, plan=plan)
-    lowered, shapes = _program(objective_of_softness, part, each[0], params, key, units[0])
+    program = functools.partial(_program, objective_of_softness, each[0], params, key)
+    lowered, line = program(functools.partial(_sampled, plan=plan), units[0]), None
     drawn = compile_once(lowered, compiler_options)
-    line = None
     if is_line:
-        landscape, _ = _program(
-            objective_of_softness, functools.partial(_by_landscape, num_reference=num_reference), each[0], params, key
-        )
-        line = compile_once(landscape, compiler_options)
+        line = compile_once(program(functools.partial(_by_landscape, num_reference=num_reference)), compiler_options)
     has_alpha = knows_noise and num_samples >= 2 * BATCH
     longer = lambda x: jax.ShapeDtypeStruct((x.shape[0], len(units) * x.shape[1], *x.shape[2:]), x.dtype)  # noqa: E731
     finish = jax.jit(functools.partial(_summary, plan=plan, has_alpha=has_alpha))
-    summarise = finish.lower(jax.tree.map(longer, shapes)).compile()
+    summarise = finish.lower(jax.tree.map(longer, lowered.out_info)).compile()
     others = range(1, 1 + -(-num_reference // num_samples))
     # C MuJoCo is called back. Two programs that wait for it at once leave JAX no thread on two cores to hand it their numbers.
     num_workers = 1 if "callback" in lowered.as_text() else _WORKERS
     alone, is_double = threading.Lock(), jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
     def work(job: tuple[int, int]) -> tuple[Samples, Any, float]:
+        (number, i), began, found = job, time.perf_counter(), None
         with jax.enable_x64(is_double):  # a thread does not see settings made by `with`
-            return part_of(*job)
-
-    def part_of(number: int, i: int) -> tuple[Samples, Any, float]:
-        began = time.perf_counter()
-        samples = jax.block_until_ready(drawn(each[i], params, jax.random.split(key)[0], units[number]))
-        spent, found = time.perf_counter() - began, None
-        if reference is not None:
-            with alone:
-                found = reference(each[i], jax.random.fold_in(key, number), -(-num_reference // len(units)))
-        elif line is not None:
-            found = line(each[i], params, jax.random.split(key)[1]) if number == 0 else None
-        else:
-            more = [drawn(each[i], params, jax.random.fold_in(key, k), units[number]) for k in others]
-            found = jax.block_until_ready(_unbiased(jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *more), plan))
-        return samples, found, spent
+            samples = jax.block_until_ready(drawn(each[i], params, jax.random.split(key)[0], units[number]))
+            spent = time.perf_counter() - began
+            if reference is not None:
+                with alone:
+                    found = reference(each[i], jax.random.fold_in(key, number), -(-num_reference // len(units)))
+            elif line is None:
+                more = [drawn(each[i], params, jax.random.fold_in(key, k), units[number]) for k in others]
+                found = _unbiased(jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *more), plan)
+            elif number == 0:
+                found = line(each[i], params, jax.random.split(key)[1])
+        return samples, jax.block_until_ready(found), spent
 
     done: list[list[tuple[Samples, Any, float]]] = [[] for _ in each]
     jobs = [(number, i) for number in range(len(units)) for i in range(count)]
@@ -457,12 +450,17 @@ def _warned(
     return objectives[-1], tuple(told)
 
 
-def _program(objective_of_softness: Callable[[PyTree], Objective], part: Callable, *given: Any) -> tuple[Any, PyTree]:
-    """Return a part of the measurement at one softness, ready to be compiled, and the shapes of its result."""
-    softness, params, *rest = given
-    program = jax.jit(lambda one, at, *rest: part(objective_of_softness(one).sized_for(at[0]), at, *rest))
-    lowered = program.lower(softness, params, *rest)
-    return lowered, lowered.out_info
+def _program(
+    objective_of_softness: Callable[[PyTree], Objective],
+    softness: PyTree,
+    params: Array,
+    key: Any,
+    part: Callable,
+    *rest: Any,
+) -> Any:
+    """Return a part of the measurement at one softness, ready to be compiled."""
+    measure = lambda one, at, *rest: part(objective_of_softness(one).sized_for(at[0]), at, *rest)  # noqa: E731
+    return jax.jit(measure).lower(softness, params, key, *rest)
 
 
 def _summary(samples: Samples, plan: Plan, has_alpha: bool) -> tuple[dict[str, Any], Samples, Array | None]:
