@@ -121,6 +121,9 @@ def fit(
         )
         ends = [*ends, (values, starts)] if is_short or ends else []
         mean = [np.mean(part, axis=0) for part in zip(*(ends or [(values, starts)]), strict=True)]
+        if len(ends) > 1:  # the mean of few has a scatter of its own
+            scatter = np.var([one for one, _ in ends], axis=0, ddof=1) / np.diag(root @ root.T)
+            at_end /= np.sqrt(1.0 + scatter.mean() / len(ends))
         found = Ensemble(*mean, at_end, misfit, drawn, len(ends) == _AVERAGED)
         say(found)
         if found.is_settled:
