@@ -45,6 +45,8 @@ from mjxgrad.stepping import assembly, slope
 from mjxgrad.stepping.contact import Discrete
 from mjxgrad.stepping.forward import advance, at_full_precision, smooth
 
+# A landing quadruped's gradient takes 6 times the discrete one's time with 4, 9 with 8, 16 with 16 (two cores). Of means
+# after 0.2 s some are off by 3 standard errors with 4, none with 8.
 NUM_SLOTS = 4
 _LEAST_LENGTH = 1e-3  # of a lever, over the extent of the model
 _COARSER = 10.0  # times, in single precision
@@ -93,9 +95,8 @@ def no_flight(model: mjx.Model, data: mjx.Data) -> Flight:
     """Return free slots."""
     count, size, dtype = NUM_SLOTS, 2 * model.nv + model.na, data.qvel.dtype
     ends = Motion(*(jnp.zeros((count, 2, n), dtype) for n in (model.nq, model.nv, model.na)))
-    none, steps = jnp.zeros(count, dtype), jnp.zeros(count, jnp.int32)
-    lengths = jax.lax.stop_gradient(_lengths(model, data))
-    return Flight(ends, none, steps, steps, jnp.zeros((count, size), dtype), none, lengths)
+    none, steps, apart = jnp.zeros(count, dtype), jnp.zeros(count, jnp.int32), jnp.zeros((count, size), dtype)
+    return Flight(ends, none, steps, steps, apart, none, jax.lax.stop_gradient(_lengths(model, data)))
 
 
 def whole(model: mjx.Model, motion: Motion, flight: Flight) -> Motion:
@@ -301,8 +302,7 @@ class _Step:
         centres, widths = jnp.zeros_like(gaps), 0.5 * h * speed
         if self.has_stages:
             centres, widths = -0.5 * h * rate, slope.STAGES * widths
-        kept = 1 / (1 + h * model.dof_damping * model.dof_invweight0)
-        fall = h**2 * jnp.abs(rows @ (kept * every.acceleration))
+        fall = h**2 * jnp.abs(rows @ (every.acceleration / (1 + h * model.dof_damping * model.dof_invweight0)))
         width = jnp.where(solimp[:, 2] > 0, jnp.minimum(solimp[:, 2], slope.USUAL_WIDTH), slope.USUAL_WIDTH)
         least = jnp.maximum(jnp.minimum(fall, slope.STIRRED * h * speed), slope.SMALLEST)
         widths = jnp.maximum(widths, jnp.minimum(slope.LEAST_WIDTH * width, least))
