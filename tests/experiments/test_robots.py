@@ -45,10 +45,9 @@ _SCENES = {
         <actuator><position joint="ball" gear="1 0 0" kp="5"/><position joint="ball" gear="0 1 0" kp="5"/></actuator></mujoco>""",
 }
 
-# Whose like tests/engines steps.
-_SLOW = [
-    one for one in _SCENES if any(word in one for word in ("crank", "muscle", "implicit", "elliptic", "ball joint"))
-]
+# Whose like tests/engines steps, and collisions of ellipsoids, which are searched for as the gripper's are.
+_WORDS = ("crank", "muscle", "implicit", "elliptic", "ball joint", "ellipsoids")
+_SLOW = [one for one in _SCENES if any(word in one for word in _WORDS)]
 
 
 @pytest.mark.filterwarnings("ignore::mjxgrad.scene.SceneWarning")

@@ -63,6 +63,7 @@ def descend(task, estimator):
     return float(eqx.filter_jit(task.final_cost)(found))
 
 
+@pytest.mark.slow
 def test_friction_separates_the_estimators_as_published():
     """First order does not see that the bodies can stay together, zeroth order does."""
     task = setting("friction")
@@ -131,6 +132,7 @@ def test_a_ball_beyond_the_pad_s_end_flies_on_and_slows_down():
     np.testing.assert_allclose(moved, [0.96, 0.19, 0.0, -0.4 * 0.999, 0.01, 0.005, 0.02], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_tennis_starts_at_the_published_cost():
     """Published over 1000 starts, so within their standard error; a ball that is missed costs ten times the others."""
     task = setting("tennis")
