@@ -372,8 +372,7 @@ def sweep(
     if not np.isfinite(result.table()["truth"]).any():
         raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
     if result.share < 1:
-        left = len(swept) - len(result.cost)
         told.append(
-            f"Interrupted after {result.share:.0%} of the rollouts" + f", without {left} stiffnesses" * bool(left) + "."
+            f"Interrupted after {result.share:.0%} of the rollouts, at {len(result.cost)} of {len(swept)} stiffnesses."
         )
     return Sweep(scene.name, " ".join(told), knob.own, result)

@@ -428,7 +428,7 @@ def bias_variance(
 def _rounds(plan: Plan) -> Int[np.ndarray, "rounds chunks units"]:
     """Return the units of each round, in chunks: the one without noise first, and in the end some that do not count."""
     total = plan.num_units + plan.with_zero_noise
-    rounds = min(_ROUNDS, max(1, plan.num_samples // _FEWEST))
+    rounds = min(max(_ROUNDS, total // DEFAULT_CHUNK_SIZE), max(1, plan.num_samples // _FEWEST))
     num_chunks = -(-total // (rounds * DEFAULT_CHUNK_SIZE))
     size = -(-total // (rounds * num_chunks))
     order = [plan.num_units] * plan.with_zero_noise + list(range(plan.num_units))
