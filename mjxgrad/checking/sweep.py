@@ -244,9 +244,8 @@ class Sweep(Paged):
                 if table[f"{taken}_is_biased"][row, 0]
                 else f"no bias was seen above {percent(reach)}"
             )
-            sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}" + ", more samples would tell" * (
-                reach > 1
-            )
+            tell = ", more samples would tell" if reach > 1 else ""
+            sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}{tell}"
         others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
         answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient."
         answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}."

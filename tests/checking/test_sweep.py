@@ -254,4 +254,4 @@ def test_a_sweep_in_single_precision_is_that_in_double(folder):
             one = mg.sweep(mg.load_scene(folder / "rest.xml"), lambda course: course.qpos[-1, 0], **given)
         found.append(np.asarray(one.result.first.value))
         assert "touches exactly at the start" in one.question
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-9)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-5)  # the scene's own numbers keep their single precision
