@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad.identification.normal import at, solved, split
+from mjxgrad.identification.normal import Step, at, solved, split
 from mjxgrad.rollouts import DivergedError
 
 # Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
@@ -28,16 +28,12 @@ _MOTIONS, _PER_NUMBER = 192, 8  # motions of an ensemble at least, and for each 
 _MOST = 16  # ensembles
 _MORE = 4  # times as many motions at most
 _NARROWER, _WIDER = 0.25, 2.0  # widths that are kept from before; where the mean has missed
-_CHATTER, _EXCESS = (
-    (1.5, 3.0, 6.0, 12.0),
-    1.0,
-)  # of its variance; standard errors of a sum of squares beyond which it is more
+# Factors of its variance; standard errors of a sum of squares beyond which it is more.
+_CHATTER, _EXCESS = (1.5, 3.0, 6.0, 12.0), 1.0
 _LONGEST = 3.0  # widths that a step goes at most
 _SHORT, _SETTLED = 0.7, 1.5  # at the end: step of each number in widths; ratio of successive widths
-_FEWEST, _AVERAGED = (
-    3,
-    3,
-)  # ensembles at least, and those at the end of which the mean is the answer: each has its scatter
+# Ensembles at least, and those at the end of which the mean is the answer: each has its scatter.
+_FEWEST, _AVERAGED = 3, 3
 
 Box = tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]
 Motions = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -75,60 +71,96 @@ def fit(
         count: number of measured numbers.
         say: called with each ensemble.
     """
-    (values, starts), rng, dim = point, np.random.default_rng(0), len(point[0])
-    num = fewest = size(dim + starts.shape[1])
-    root = np.diag(widths[0])
-    ends: list[tuple[np.ndarray, np.ndarray]] = []
-    lowest = np.inf
-    own, along = widths[1][:, :, None] * np.eye(starts.shape[1]), np.zeros((*starts.shape, dim))
-    for index in range(1, _MOST + 1):
-        drawn = np.clip(values + rng.normal(size=(num, dim)) @ root.T, *box)
-        free = np.einsum("wij,mwj->mwi", own, rng.normal(size=(num, *starts.shape)))
-        free += starts + np.einsum("wij,mj->mwi", along, drawn - values)
-        residuals = motions(drawn, free)
+    rng, dim, lowest = np.random.default_rng(0), len(point[0]), np.inf
+    free = widths[1].shape[1]
+    own, along = widths[1][:, :, None] * np.eye(free), np.zeros((*point[1].shape, dim))
+    law = _Law(*point, np.diag(widths[0]), own, along)
+    num = fewest = size(dim + free)
+    most = count * noise**2 * (1.0 + _EXCESS * np.sqrt(2.0 / count))
+    ends: list[_Law] = []
+    index = 0
+    while True:
+        index += 1
+        drawn, starts = law.draw(num, rng, box)
+        residuals = motions(drawn, starts)
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
-        drawn, free, residuals = drawn[is_finite], free[is_finite], residuals[is_finite]
-        if len(drawn) < 2 * (dim + starts.shape[1]) + 2:
+        drawn, starts = drawn[is_finite], starts[is_finite]
+        if len(drawn) < 2 * (dim + free) + 2:
             raise DivergedError("most motions must stay finite about the best values, got few: give narrower bounds")
-        middle, centres = drawn.mean(axis=0), free.mean(axis=0)
-        model, most = Regression(drawn, free, residuals), count * noise**2 * (1.0 + _EXCESS * np.sqrt(2.0 / count))
-        for (
-            chatter
-        ) in _CHATTER:  # its tails are longer than the normal's; the misfit tells where the recording has more
-            factors, sureness = model.weighed(noise, chatter)
-            step = solved(factors, dim, (box[0] - middle, box[1] - middle))
-            if step.squares < most:
-                break
-        length = float(np.linalg.norm(np.linalg.lstsq(root, step.values, rcond=None)[0]))
+        middle, centres = drawn.mean(axis=0), starts.mean(axis=0)
+        factors, sureness, step = _explained(
+            Regression(drawn, starts, residuals[is_finite]), noise, (box[0] - middle, box[1] - middle), dim, most
+        )
+        length = float(np.linalg.norm(np.linalg.lstsq(law.root, step.values, rcond=None)[0]))
         change = step.values * min(1.0, _LONGEST / max(length, 1e-300))
-        by_start, mixed, slope, _ = split(factors, dim)
-        inner = np.linalg.pinv(by_start)
         moved, misfit = at(factors, change)
-        at_end = factors * sureness
-        at_end[..., -1] = 0.0  # nothing is left to go
-        growth = np.sqrt(max(misfit / (count * noise**2), 1.0)) * noise
         # A mean that explains less than that of a wider ensemble has missed: between two teeth all looks smooth.
         has_missed, lowest = misfit > max(most, lowest * most / (count * noise**2)), min(lowest, misfit)
         num = min(2 * num, _MORE * fewest) if has_missed else num  # few motions lack directions of chatter
-        before, root = root, growth * np.linalg.pinv(slope, rcond=1e-9)
-        wider = (_WIDER if has_missed else _NARROWER) * before
-        root = np.linalg.cholesky(root @ root.T + wider @ wider.T + np.outer(change, change) + 1e-14 * np.eye(dim))
-        own, along = growth * inner, -np.einsum("wij,wjk->wik", inner, mixed[..., :-1])
-        values, starts = middle + change, centres + moved
-        shrunk = np.sqrt(np.diag(before @ before.T) / np.diag(root @ root.T))
-        is_short = (
-            not has_missed and length < _SHORT * np.sqrt(dim) and bool((shrunk < _SETTLED).all()) and index >= _FEWEST
-        )
-        ends = [*ends, (values, starts)] if is_short or ends else []
-        mean = [np.mean(part, axis=0) for part in zip(*(ends or [(values, starts)]), strict=True)]
-        if len(ends) > 1:  # the mean of few has a scatter of its own
-            scatter = np.var([one for one, _ in ends], axis=0, ddof=1) / np.diag(root @ root.T)
-            at_end /= np.sqrt(1.0 + scatter.mean() / len(ends))
-        found = Ensemble(*mean, at_end, misfit, drawn, len(ends) == _AVERAGED)
+        growth = float(np.sqrt(max(misfit / (count * noise**2), 1.0))) * noise
+        before, kept = law, (_WIDER if has_missed else _NARROWER) * law.root
+        law = _law(factors, middle + change, centres + moved, growth, kept, change)
+        stays = length < _SHORT * np.sqrt(dim) and bool((before.variances < _SETTLED**2 * law.variances).all())
+        is_short = stays and not has_missed and index >= _FEWEST
+        ends = [*ends, law] if is_short or ends else []
+        found = _mean_of(ends or [law], factors * sureness, misfit, drawn)
         say(found)
-        if found.is_settled:
+        if found.is_settled or index == _MOST:
+            return found
+
+
+class _Law(NamedTuple):
+    """What motions are drawn from: means, a root of the covariance of values, and starts by noise of their own and by values."""
+
+    values: Float[np.ndarray, " dim"]
+    starts: Float[np.ndarray, "windows free"]
+    root: Float[np.ndarray, "dim dim"]
+    own: Float[np.ndarray, "windows free free"]
+    along: Float[np.ndarray, "windows free dim"]
+
+    @property
+    def variances(self) -> Float[np.ndarray, " dim"]:
+        """Return the variances of the values."""
+        return np.sum(self.root**2, axis=1)
+
+    def draw(self, num: int, rng: np.random.Generator, box: Box) -> tuple[np.ndarray, np.ndarray]:
+        """Return values and starts of so many motions."""
+        drawn = np.clip(self.values + rng.normal(size=(num, len(self.values))) @ self.root.T, *box)
+        noise = np.einsum("wij,mwj->mwi", self.own, rng.normal(size=(num, *self.starts.shape)))
+        return drawn, self.starts + noise + np.einsum("wij,mj->mwi", self.along, drawn - self.values)
+
+
+def _law(
+    factors: np.ndarray, values: np.ndarray, starts: np.ndarray, growth: float, kept: np.ndarray, change: np.ndarray
+) -> _Law:
+    """Return what the next motions are drawn from: what factors leave open, a share of the former law, and the last change."""
+    by_start, mixed, slope, _ = split(factors, len(values))
+    inner, root = np.linalg.pinv(by_start), growth * np.linalg.pinv(slope, rcond=1e-9)
+    covariance = root @ root.T + kept @ kept.T + np.outer(change, change) + 1e-14 * np.eye(len(values))
+    along = -np.einsum("wij,wjk->wik", inner, mixed[..., :-1])
+    return _Law(values, starts, np.linalg.cholesky(covariance), growth * inner, along)
+
+
+def _explained(model: "Regression", noise: float, room: Box, dim: int, most: float) -> tuple[np.ndarray, float, Step]:
+    """Return factors, how sure they are, and the step; chatter counts for more until it explains what recordings have more."""
+    factors, sureness = model.weighed(noise, _CHATTER[0])
+    step = solved(factors, dim, room)
+    for chatter in _CHATTER[1:]:  # its tails are longer than the normal's
+        if step.squares < most:
             break
-    return found
+        factors, sureness = model.weighed(noise, chatter)
+        step = solved(factors, dim, room)
+    return factors, sureness, step
+
+
+def _mean_of(ends: list[_Law], factors: np.ndarray, misfit: float, drawn: np.ndarray) -> Ensemble:
+    """Return the mean of the last ensembles, whose scatter widens the intervals."""
+    values, starts = np.mean([one.values for one in ends], axis=0), np.mean([one.starts for one in ends], axis=0)
+    factors[..., -1] = 0.0  # nothing is left to go
+    if len(ends) > 1:
+        scatter = np.var([one.values for one in ends], axis=0, ddof=1) / ends[-1].variances
+        factors /= np.sqrt(1.0 + scatter.mean() / len(ends))
+    return Ensemble(values, starts, factors, misfit, drawn, len(ends) == _AVERAGED)
 
 
 class Regression:

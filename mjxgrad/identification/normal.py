@@ -30,7 +30,7 @@ def factors_of(
 
 def _triangle(columns: np.ndarray) -> np.ndarray:
     missing = max(columns.shape[2] - columns.shape[1], 0)
-    return np.linalg.qr(np.pad(columns, ((0, 0), (0, missing), (0, 0))), mode="r")
+    return np.asarray(np.linalg.qr(np.pad(columns, ((0, 0), (0, missing), (0, 0))), mode="r"))
 
 
 def split(factors: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

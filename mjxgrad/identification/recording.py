@@ -126,7 +126,7 @@ class Windows(NamedTuple):
 
     state: State
     controls: Float[np.ndarray, "windows steps nu"]
-    index: Int[np.ndarray, "windows rows"]
+    index: Int[np.ndarray, "windows rows"]  # pyright: ignore[reportIncompatibleMethodOverride]
     share: Float[np.ndarray, "windows rows"]
     measured: dict[str, Float[np.ndarray, "windows rows _"]]
     weight: dict[str, Float[np.ndarray, "windows rows _"]]

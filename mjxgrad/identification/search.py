@@ -137,9 +137,10 @@ def outlook(
     """
     search = _Search(_checked(scene, parameters, recordings, delay, free_start, contact), 1, None)
     problem, start = search.problem, search.end
+    residual = problem.residuals([start.point], problem.num_steps)[0]
     widths = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], 0.3)
-    linear = search.linear(start.point, start.residual, widths, problem.num_steps, 1.0)
-    factors = factors_of(start.residual, linear.slope, linear.by_start)
+    linear = search.linear(start.point, residual, widths, problem.num_steps, 1.0)
+    factors = factors_of(residual, linear.slope, linear.by_start)
     seconds, num = search.price(search.is_rugged(linear, start.point, 1.0))
     coordinates = problem.motions.coordinates
     slope = _slope(problem, factors, coordinates.nominal)
@@ -206,10 +207,10 @@ class _Search:
         self._latest: tuple[Point, np.ndarray] | None = None
         self._pace = math.inf  # s of a motion of all windows
         start = Point(np.zeros(problem.count), np.zeros(problem.sizes.shape))
-        for _ in range(2):  # the first call compiles
-            began = time.monotonic()
-            residual = problem.residuals([start] * 2, problem.num_steps)[0]
-            self._pace = (time.monotonic() - began) / 2
+        problem.residuals([start] * 2, problem.num_steps)  # compiles
+        began = time.monotonic()
+        residual = problem.residuals([start] * 2, problem.num_steps)[0]
+        self._pace = (time.monotonic() - began) / 2
         if not np.isfinite(residual).all():
             raise DivergedError(
                 "nominal values must give motions that stay finite, got one that diverged: begin elsewhere"
@@ -263,14 +264,18 @@ class _Search:
 
     def _descend(self, point: Point, noise: float | None) -> tuple[Stopped, bool]:
         """Minimise the residuals from a point over horizons that grow; return why it ended and whether the end is rugged."""
-        problem, widths = self.problem, None
+        problem = self.problem
+        widths: tuple[np.ndarray, np.ndarray] | None = None
         needed = 2 * (problem.count + problem.sizes.shape[1])
         horizons = [max(round(share * problem.num_steps), 1) for share in _HORIZONS]
-        horizons = [*(steps for steps in horizons[:-1] if self._counts(steps) > needed), horizons[-1]]
-        for steps in horizons:
-            stopped, point, linear, widths = self._minimise(point, widths, steps, is_last=False)
-            if stopped is Stopped.STEPS:
-                return stopped, False
+        for steps in horizons[:-1]:
+            if self._counts(steps) > needed:
+                stopped, point, _, widths = self._minimise(point, widths, steps, is_last=False)
+                if stopped is Stopped.STEPS:
+                    return stopped, False
+        stopped, point, linear, widths = self._minimise(point, widths, horizons[-1], is_last=False)
+        if stopped is Stopped.STEPS:
+            return stopped, False
         if self.is_rugged(linear, point, self.noise(noise)):
             return stopped, True
         stopped, point, linear, _ = self._minimise(point, widths, horizons[-1], is_last=True)
@@ -288,16 +293,17 @@ class _Search:
         """Go down by Levenberg and Marquardt's steps over so many time steps."""
         problem, is_whole = self.problem, steps == self.problem.num_steps
         numbers = problem.num_numbers if is_whole else max(int(self._counts(steps)), 1)
-        residual = problem.residuals([point], steps)[0]
+        residual: np.ndarray = problem.residuals([point], steps)[0]
+        first = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], _FIRST)
+        near: tuple[np.ndarray, np.ndarray] = widths if widths is not None else first
         share = _NARROW / math.sqrt(numbers) if is_last else _WIDE
         if not np.isfinite(residual).all():
             raise DivergedError("the best values so far give a motion that diverges")
         damping, trials, box = _DAMPED[0], 0, problem.motions.coordinates.box()
         while True:
             total = float((residual**2).sum())
-            widths = widths or (np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], _FIRST))
-            linear = self.linear(point, residual, widths, steps, share)
-            widths = linear.widths
+            linear = self.linear(point, residual, near, steps, share)
+            near = linear.widths
             factors = factors_of(residual, linear.slope, linear.by_start)
             if is_whole and total <= self.end.squares:
                 self.end = _End(point, factors, total, residual)
@@ -305,12 +311,12 @@ class _Search:
             self._say(math.sqrt(total / numbers), steps / problem.num_steps)
             room = box[0] - point.values, box[1] - point.values
             if self.num_steps >= self._most:
-                return Stopped.STEPS, point, linear, widths
+                return Stopped.STEPS, point, linear, near
             newton = solved(factors, problem.count, room)
             self._to_go = newton.length * numbers / max(total, 1e-300)
             is_exact = math.sqrt(total / numbers) < self._rounding * self.first
             if is_exact or (is_whole and self._to_go < _CLOSE):
-                return Stopped.CONVERGED, point, linear, widths
+                return Stopped.CONVERGED, point, linear, near
             while True:
                 trials += 1
                 step = solved(factors, problem.count, room, damping)
@@ -323,10 +329,10 @@ class _Search:
                 if is_better or damping > _DAMPED[1] or trials >= _TRIALS[is_whole]:
                     break
             if not is_better:
-                return Stopped.CONVERGED, point, linear, widths
+                return Stopped.CONVERGED, point, linear, near
             gain, point, residual = total - float((after**2).sum()), trial, after
             if gain * (numbers if is_last else 1) < (_CLOSE if is_last else _ENOUGH) * total:
-                return Stopped.CONVERGED, point, linear, widths
+                return Stopped.CONVERGED, point, linear, near
 
     def _counts(self, steps: int) -> int:
         windows = self.problem.windows
