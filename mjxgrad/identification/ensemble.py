@@ -110,7 +110,7 @@ def fit(
 
 
 class _Law(NamedTuple):
-    """What motions are drawn from: means, a root of the covariance of values, and starts by noise of their own and by values."""
+    """The law of motions: means, a root of the covariance of values, and starts by noise of their own and along values."""
 
     values: Float[np.ndarray, " dim"]
     starts: Float[np.ndarray, "windows free"]
