@@ -142,8 +142,8 @@ def nearest(found: Sequence[Slope], price: int | float = np.inf) -> Kind:
         return "slope"
     if discrete.error <= CLOSE or gains.mean() <= 0:
         return "discrete"
-    # In standard errors: a slope of eight times the price must be nearer by three.
-    needed = 1.0 if not np.isfinite(price) else np.clip(np.log2(price), 0.0, 3.0)
+    # In standard errors: a slope of four times the price or more must be nearer by two. A bias costs more than time does.
+    needed = 1.0 if not np.isfinite(price) else np.clip(np.log2(price), 0.0, 2.0)
     return "slope" if gains.mean() > needed * gains.std() / np.sqrt(gains.size) else "discrete"
 
 
