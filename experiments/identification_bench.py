@@ -351,7 +351,7 @@ def recorded(robot: Robot, seed: int, count: int = 5) -> Set:
     for name, (kind, *arguments) in robot.ours.items():
         if callable(kind):
             (nominal,) = arguments
-            made = identification.Parameter(nominal, nominal / 10, 10 * nominal, kind)
+            made = identification.Parameter(nominal, nominal / 10, 10 * nominal, kind)  # pyright: ignore[reportArgumentType]
         else:
             names = [one for one in arguments if isinstance(one, str)]
             given = dict(zip(("column", "bounds"), arguments[len(names) :], strict=False))
