@@ -1,13 +1,14 @@
-"""Who steps a scene, and takes derivatives of its steps: MJX or C MuJoCo, behind the same calls."""
+"""Who steps a scene, and takes derivatives of its steps: MJX, C MuJoCo or MuJoCo Warp, behind the same calls."""
 
 from mjxgrad.engines.engine import Engine, Motion, Observe, PolicyFunction, Rows, Sees
 from mjxgrad.engines.mjx import MJX
 from mjxgrad.engines.mujoco import MuJoCo
 from mjxgrad.engines.state import DivergedError, State, Trajectory
+from mjxgrad.engines.warp import Warp
 from mjxgrad.scene import Scene, SceneError
 from mjxgrad.stepping import Contact, Discrete, EngineName, check_contact
 
-ENGINES: dict[EngineName, Engine] = {"mjx": MJX(), "mujoco": MuJoCo()}
+ENGINES: dict[EngineName, Engine] = {"mjx": MJX(), "mujoco": MuJoCo(), "warp": Warp()}
 QUICK: EngineName = "mujoco"
 """The engine whose first step does not wait for a compiler."""
 
@@ -21,7 +22,8 @@ def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
     """
     check_contact(contact)
     engine = ENGINES[getattr(contact, "engine", None) or scene.engine]
-    if isinstance(contact, engine.contacts) and not (engine.compiles and scene.unsupported):
+    is_able = engine is not ENGINES["mjx"] or not scene.unsupported
+    if isinstance(contact, engine.contacts) and is_able:
         return engine
     if scene.unsupported:
         raise SceneError(scene.unsupported)

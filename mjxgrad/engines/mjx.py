@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import warnings
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,17 +41,17 @@ class MJX:
         # Functions may read changing variables: every call traces them anew, unless the caller compiles.
         has_functions = motion.policy is not None or motion.observe is not None
         is_known = not is_traced((motion, state, rows))
-        found = (_roll_out_compiled if is_known and not has_functions else _roll_out)(motion, state, rows)
+        found = (_roll_out_compiled if is_known and not has_functions else roll_out)(motion, state, rows)
         is_own = isinstance(motion.contact, OwnMotion) and is_known and not is_traced(found)
         if is_own and (message := parting(motion.scene, found, rows.inputs)):
             warnings.warn(f"{motion.scene.name}: {message}", SceneWarning, stacklevel=3)
         return found
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
-        def advance(now: _Moving, _: None) -> tuple[_Moving, None]:
+        def advance(now: Moving, _: None) -> tuple[Moving, None]:
             return now.stepped(scene.model, data_of(scene, now.state, ctrl), contact)[1], None
 
-        first = _Moving.at(scene, state, contact)
+        first = Moving.at(scene, state, contact)
         return jax.lax.scan(advance, first, None, length=num_steps)[0].end(scene.model, state)
 
     def look(
@@ -81,22 +81,22 @@ class MJX:
         return of_state[:, :size], of_state[:, size:], of_sensors[:, :size], of_sensors[:, size:]
 
 
-class _Moving(eqx.Module):
+class Moving(eqx.Module):
     """A state, and what is in flight beside it where a slope is asked for; see `stepping.pairs`."""
 
     state: State
     flight: pairs.Flight | None
 
     @staticmethod
-    def at(scene: Scene, state: State, contact: Contact) -> "_Moving":
+    def at(scene: Scene, state: State, contact: Contact) -> "Moving":
         """Return a state that may have pairs in flight; its derivative is then that of all."""
         alone = dataclasses.replace(state, pairs=None)
         if not isinstance(contact, Slope):
-            return _Moving(alone, None)
+            return Moving(alone, None)
         if not isinstance(state.pairs, pairs.Flight):
-            return _Moving(alone, pairs.no_flight(scene.model, scene.data))
+            return Moving(alone, pairs.no_flight(scene.model, scene.data))
         own = pairs.without(scene.model, pairs.Motion(state.qpos, state.qvel, state.act), state.pairs)
-        return _Moving(dataclasses.replace(alone, **own._asdict()), state.pairs)
+        return Moving(dataclasses.replace(alone, **own._asdict()), state.pairs)
 
     def seen(self, model: mjx.Model) -> State:
         """Return the state with its whole derivative."""
@@ -111,13 +111,13 @@ class _Moving(eqx.Module):
         kept = given.pairs if is_kept and self.flight is None else self.flight
         return dataclasses.replace(self.seen(model), pairs=kept if is_kept else None)
 
-    def stepped(self, model: mjx.Model, data: mjx.Data, contact: Contact) -> tuple[mjx.Data, "_Moving"]:
+    def stepped(self, model: mjx.Model, data: mjx.Data, contact: Contact) -> tuple[mjx.Data, "Moving"]:
         """Return the data after a step from data of this state, and the next of these."""
         if self.flight is None:
             data, flight = step(model, data, contact=contact), None
         else:
             data, flight = pairs.follow(model, data, self.flight)
-        return data, _Moving(state_of(data), flight)
+        return data, Moving(state_of(data), flight)
 
 
 class _Carry(NamedTuple):
@@ -127,17 +127,17 @@ class _Carry(NamedTuple):
     the state does; its tangent is followed, and nothing is differentiated by it.
     """
 
-    moving: _Moving
+    moving: Moving
     before: Array | None
     first_bad: Array
     unsolved: Array
     crowded: Array
-    watched: _Moving | None
+    watched: Moving | None
     tangent: tuple[Array, ...] | None
     growth: Array | None
 
 
-class _Scan(Motion):
+class Scan(Motion):
     """The loop over the steps of one rollout."""
 
     def begin(self, state: State) -> _Carry:
@@ -146,7 +146,7 @@ class _Scan(Motion):
         # A NaN in the contacts of a traced model would go unnoticed.
         traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
-        moving = _Moving.at(self.scene, state, self.contact)
+        moving = Moving.at(self.scene, state, self.contact)
         watched = jax.lax.stop_gradient(moving) if self.measure_growth else None
         return _Carry(
             moving,
@@ -170,7 +170,8 @@ class _Scan(Motion):
             row = one_each(self.policy(self.params, state if carry.before is None else seen), model.nu)
         ctrl = row + disturbance
         data = data_of(self.scene, carry.moving.state, ctrl).replace(**forces)
-        stepped, moving = carry.moving.stepped(model, data, self.contact)
+        stepped, moving = self.step(carry.moving, data)
+        is_unsolved, is_crowded = self.troubles(stepped)
         is_bad = ~is_sound(*(getattr(moving.state, name) for name in ("qpos", "qvel", "act")))
         first_bad = jnp.where((carry.first_bad < 0) & is_bad, index, carry.first_bad)
         watched, tangent, growth = self.measure(carry, data)
@@ -178,8 +179,8 @@ class _Scan(Motion):
             jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), carry.moving, moving),
             None if carry.before is None else ctrl.astype(carry.before.dtype),
             first_bad,
-            carry.unsolved + ((first_bad < 0) & (stepped._impl.solver_niter > model.opt.iterations)),
-            carry.crowded + ((first_bad < 0) & _is_crowded(model, jax.lax.stop_gradient(stepped), self.contact)),
+            carry.unsolved + ((first_bad < 0) & is_unsolved),
+            carry.crowded + ((first_bad < 0) & is_crowded),
             watched,
             tangent,
             growth,
@@ -188,15 +189,25 @@ class _Scan(Motion):
         observed = self.look(state, ctrl, forces, None if moving.flight is not None else stepped)
         return following, (state.qpos, state.qvel, state.act, ctrl, observed, seen)
 
-    def measure(self, carry: _Carry, data: mjx.Data) -> tuple[_Moving | None, tuple | None, Array | None]:
+    def step(self, moving: Moving, data: mjx.Data) -> tuple[Any, Moving]:
+        """Return what a step from data of this state found, and the next of these."""
+        return moving.stepped(self.scene.model, data, self.contact)
+
+    def troubles(self, stepped: Any) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+        """Return whether a step was not solved to the end, and whether contacts lacked room."""
+        model = self.scene.model
+        crowded = _is_crowded(model, jax.lax.stop_gradient(stepped), self.contact)
+        return stepped._impl.solver_niter > model.opt.iterations, crowded
+
+    def measure(self, carry: _Carry, data: mjx.Data) -> tuple[Moving | None, tuple | None, Array | None]:
         """Return what is watched after a step from data, its tangent there, and the largest norm of that so far."""
         if carry.watched is None or carry.tangent is None or carry.growth is None:
             return None, None, None
         model, data, watched = jax.lax.stop_gradient((self.scene.model, data, carry.watched))
 
-        def motion(qpos: Array, qvel: Array, *held: Array) -> tuple[tuple, _Moving]:
+        def motion(qpos: Array, qvel: Array, *held: Array) -> tuple[tuple, Moving]:
             flight = watched.flight if not held else eqx.tree_at(lambda x: x.held, watched.flight, held[0])
-            after = _Moving(watched.state, flight).stepped(model, data.replace(qpos=qpos, qvel=qvel), self.contact)[1]
+            after = self.step(Moving(watched.state, flight), data.replace(qpos=qpos, qvel=qvel))[1]
             seen = after.seen(model)
             return ((after.state.qpos, after.state.qvel, *_held(after)), (seen.qpos, seen.qvel)), after
 
@@ -206,7 +217,7 @@ class _Scan(Motion):
         growth = jnp.maximum(carry.growth, jnp.linalg.norm(jnp.concatenate(whole)))  # a NaN stays one
         return after, change, growth
 
-    def look(self, state: State, ctrl: Array, forces: dict, stepped: mjx.Data | None = None) -> PyTree:
+    def look(self, state: State, ctrl: Array, forces: dict, stepped: Any = None) -> PyTree:
         """Return the observations in a state under a control, from the data of a step where it is given."""
         if self.observe is None:
             return None
@@ -219,13 +230,14 @@ class _Scan(Motion):
         return self.observe(model, stepped.replace(**at_start))
 
 
-def _held(moving: _Moving) -> tuple[Array, ...]:
+def _held(moving: Moving) -> tuple[Array, ...]:
     return () if moving.flight is None else (moving.flight.held,)
 
 
-def _roll_out(motion: Motion, state: State, rows: Rows) -> Trajectory:
-    scan = _Scan(**{field.name: getattr(motion, field.name) for field in dataclasses.fields(motion)})
-    advance = functools.partial(_Scan.advance, scan)  # a bound method of a pytree has no hash
+def roll_out(motion: Motion, state: State, rows: Rows, loop: type[Scan] = Scan) -> Trajectory:
+    """Return the result of `rollout` by a loop."""
+    scan = loop(**{field.name: getattr(motion, field.name) for field in dataclasses.fields(motion)})
+    advance = functools.partial(loop.advance, scan)  # a bound method of a pytree has no hash
     if scan.checkpoint:
         keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
         # Inside a scan prevent_cse is needless: XLA cannot merge the recomputation with the forward pass.
@@ -252,7 +264,7 @@ def _roll_out(motion: Motion, state: State, rows: Rows) -> Trajectory:
     )
 
 
-_roll_out_compiled = compiled(_roll_out)
+_roll_out_compiled = compiled(roll_out)
 
 
 def _is_crowded(model: mjx.Model, data: mjx.Data, contact: Contact) -> Bool[Array, ""]:

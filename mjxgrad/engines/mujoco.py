@@ -230,6 +230,13 @@ def _observed(scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inp
     start, resting = _arguments(scene, state)
     given = {name: value[None] for name, value in (resting | inputs | {"ctrl": ctrl}).items()}
     readings = rule.sense(scene, {name: value[None] for name, value in start.items()}, given)[0]
+    return observed(scene, state, ctrl, inputs, readings, observe)
+
+
+def observed(
+    scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, readings: Float[Array, " sensors"], observe: Observe
+) -> PyTree:  # fmt: skip
+    """Return what a function of model and data sees where the readings of sensors are known, and places by kinematics."""
     known = {"qpos": state.qpos, "qvel": state.qvel, "act": state.act, "ctrl": ctrl, "time": state.time, **inputs}
     at = data_of(scene, state, ctrl).replace(**inputs)
     placed = com_pos(scene.model, kinematics(scene.model, at))
@@ -239,6 +246,6 @@ def _observed(scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inp
         is_number = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
         return jnp.full_like(value, jnp.nan) if is_number else value
 
-    # Forces and accelerations that only C MuJoCo has would be zeros of the template.
+    # Forces and accelerations that only MuJoCo has would be zeros of the template.
     data: mjx.Data = jax.tree.map(unknown, scene.data).replace(**known)
     return observe(scene.model.replace(sensor_needstage=scene.mj_model.sensor_needstage), data)  # pyright: ignore[reportCallIssue]

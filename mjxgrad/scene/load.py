@@ -37,6 +37,8 @@ from mjxgrad.stepping import EngineName
 _FLOAT32_TOLERANCE = 1e-6
 MOST_PAIRS = 20_000
 """Largest number of geom pairs; loading more takes minutes and is refused."""
+_OF_FILES: dict[EngineName | None, str] = {"mujoco": "C MuJoCo", "warp": "MuJoCo Warp"}
+"""Engines that step a file as it is."""
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -65,8 +67,8 @@ def load_scene(
         max_contacts: number of contact slots per friction dimension (`condim`), for the nearest contacts; only these cost
             anything in the solve. None has room for all possible contacts. `Trajectory.crowded` counts the steps that filled
             all slots.
-        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is. None prefers MJX, but
-            not for contacts of meshes and height fields, which MJX finds by rules of its own.
+        engine: "mjx" refuses scenes that MJX cannot step, "mujoco" has C MuJoCo step the file as it is, "warp" MuJoCo Warp. None
+            prefers MJX, but not for contacts of meshes and height fields, which MJX finds by rules of its own.
 
     Returns:
         The scene. `print(scene.summary())` describes it.
@@ -101,7 +103,8 @@ def load_scene(
         model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS, **touching})
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
-    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported)  # pyright: ignore[reportArgumentType]
+    chosen = engine if engine == "warp" else None
+    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported, chosen)  # pyright: ignore[reportArgumentType]
     messages = [f"MuJoCo says: {text}" for text in told]
     messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
     head, *more = unsupported.splitlines() or [""]
@@ -184,8 +187,10 @@ def _converted(
     """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
     original = copy.deepcopy(model)
     try:
-        if engine == "mujoco":
-            raise SceneError(f"{name} was loaded for C MuJoCo: leave out engine='mujoco' to step it by MJX")
+        if engine in _OF_FILES:
+            raise SceneError(
+                f"{name} was loaded for {_OF_FILES[engine]}: leave out engine={engine!r} to step it by MJX"
+            )
         if count_pairs(model) > MOST_PAIRS:
             raise SceneError(
                 f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "

@@ -77,7 +77,7 @@ class Scene(eqx.Module):
         return self.chosen or ("mujoco" if self.unsupported else "mjx")
 
     def with_engine(self, engine: EngineName) -> "Scene":
-        """Return the scene stepped by MJX, or by C MuJoCo: on all cores, without compilation, differentiable once.
+        """Return the scene stepped by MJX, by C MuJoCo: on all cores, without compilation, differentiable once; or by MuJoCo Warp.
 
         Raises:
             ValueError: if there is no such engine.

@@ -20,7 +20,7 @@ import jax
 from mjxgrad.stepping.onset import Onset
 from mjxgrad.stepping.smoothing import Smoothing
 
-EngineName = Literal["mjx", "mujoco"]
+EngineName = Literal["mjx", "mujoco", "warp"]
 Gradient = Literal["discrete", "slope"]
 """Names of the derivatives along MuJoCo's own motion, for command lines and files; see `own_motion`."""
 

@@ -1,0 +1,251 @@
+"""MuJoCo Warp, by MJX's bridge: nearly any scene, for thousands of states at once on NVIDIA GPUs, in single precision.
+
+It has no derivative of its own. A step's derivative is by central differences of whole steps: every column is two more worlds of
+the same call. Rounding wants other widths for positions, which curve, than for velocities and inputs, which hardly do. Reverse
+mode keeps states alone and makes the columns again, as many at a time as memory takes.
+"""
+
+import dataclasses
+import functools
+import weakref
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float, PyTree
+
+from mjxgrad._mjx import mjx
+from mjxgrad.bodies import spatial, tree
+from mjxgrad.bodies.kinematics import integrate_position
+from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows
+from mjxgrad.engines.mjx import MJX, Moving, Scan, roll_out
+from mjxgrad.engines.mujoco import observed
+from mjxgrad.engines.state import State, Trajectory, state_of
+from mjxgrad.scene import Scene, SceneError
+from mjxgrad.scene.scene import changed_numbers
+from mjxgrad.stepping import Contact, Discrete
+
+_POSITION, _OTHER = 3e-5, 1e-3  # widths of differences (m or rad; m/s, rad/s or the unit of an input)
+_AT_ONCE = 2**32  # bytes of the worlds that are stepped in one call
+_ROOM = 64  # contacts of a world, where none is given
+_MOTION = ("qpos", "qvel", "act")
+_GIVEN = (*_MOTION, "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "qacc_warmstart", "time")
+_INEXACT = (
+    1 << 9 | 1 << 10
+)  # bits of Warp's overflow: iterations of the solver and of its line search; others are of room
+_Values = dict[str, Array]
+
+
+class Warp(MJX):
+    """MuJoCo Warp; see `engines.engine.Engine`. What it shares with MJX is the loop over steps."""
+
+    title: ClassVar[str] = "MuJoCo Warp"
+    contacts: ClassVar[tuple[type, ...]] = (Discrete,)
+
+    def complete(self, scene: Scene, state: State, contact: Contact) -> State:
+        return state
+
+    def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
+        _check(motion.scene)
+        return roll_out(motion, state, rows, _Scan)
+
+    def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
+        rows = Rows(jnp.broadcast_to(ctrl, (num_steps, len(ctrl))), jnp.zeros((num_steps, len(ctrl))), {})
+        return self.roll_out(Motion(scene, None, None, None, "state", True, contact, False), state, rows).final
+
+    def look(
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
+    ) -> PyTree:
+        _check(scene)
+        readings = _step(scene, state, ctrl, inputs)["sensordata"]
+        return observed(scene, state, ctrl, inputs, readings, observe)
+
+    def linearise(
+        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
+    ) -> tuple[Array, Array, Array, Array]:
+        _check(scene)
+        worlds, given = worlds_of(scene.mj_model), _given(scene, state, ctrl, {})
+        matrix = worlds.derivative(given, (*_MOTION, "ctrl"))
+        size = 2 * scene.model.nv + scene.model.na
+        A, C = jnp.split(matrix[:, :size], [size])
+        B, D = jnp.split(matrix[:, size:], [size])
+        return A, B, C, D
+
+
+class _Scan(Scan):
+    """The loop of a rollout by Warp."""
+
+    def step(self, moving: Moving, data: mjx.Data) -> tuple[Any, Moving]:
+        found = _step(self.scene, state_of(data), data.ctrl, {name: getattr(data, name) for name in _GIVEN[4:8]})
+        parts = {name: found[name] for name in _MOTION} | {"time": found["time"], "warmstart": found["qacc_warmstart"]}
+        return found, Moving(dataclasses.replace(moving.state, **parts), None)
+
+    def troubles(self, stepped: _Values) -> tuple[Array, Array]:
+        overflow = stepped["overflow"]
+        return (overflow & _INEXACT) > 0, (overflow & ~_INEXACT) > 0
+
+    def look(self, state: State, ctrl: Array, forces: dict, stepped: _Values | None = None) -> PyTree:
+        if self.observe is None:
+            return None
+        found = _step(self.scene, state, ctrl, forces) if stepped is None else stepped
+        return observed(self.scene, state, ctrl, forces, found["sensordata"], self.observe)
+
+
+class Worlds:
+    """Steps of many worlds of one C model, and their differences."""
+
+    def __init__(self, mj_model: mujoco.MjModel):
+        self._mj_model, self._runs = weakref.ref(mj_model), tree.joint_runs(mj_model)
+        self.room = _ROOM
+        try:
+            self._model = mjx.put_model(mj_model, impl="warp")
+            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(mj_model, 1)) if eqx.is_array(x))
+        except (NotImplementedError, RuntimeError) as error:
+            remedy = "" if "not installed" not in str(error) else ": pip install 'mjxgrad[warp]'"
+            raise SceneError(f"MuJoCo Warp cannot step it: {error}{remedy}") from error
+        self._run = custom_vmap(self._once)
+        self._run.def_vmap(self._batched)
+        self.step = jax.custom_jvp(self._step)
+        self.step.defjvp(self._derived, symbolic_zeros=True)
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """Return the C model."""
+        model = self._mj_model()
+        assert model is not None
+        return model
+
+    def _data(self, mj_model: mujoco.MjModel, count: int) -> mjx.Data:
+        return mjx.make_data(mj_model, impl="warp", naconmax=count * self.room, njmax=None)
+
+    def _once(self, given: _Values) -> _Values:
+        """Return the next states of worlds, which are the leading axis."""
+        count = len(given["qpos"])
+        most = max(1, _AT_ONCE // self._size)
+        if count > most:
+            num = -(-count // most)
+            each = -(-count // num)
+            padded = {
+                k: jnp.pad(x, [(0, num * each - count)] + [(0, 0)] * (x.ndim - 1), mode="edge")
+                for k, x in given.items()
+            }
+            parts = {k: x.reshape(num, each, *x.shape[1:]) for k, x in padded.items()}
+            found = jax.lax.map(self._once, parts)
+            return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
+        data = self._data(self.mj_model, count)
+        single = {k: x.astype(jnp.float32) for k, x in given.items()}
+        after = jax.vmap(lambda one: mjx.step(self._model, data.replace(**one)))(single)
+        dtype = given["qpos"].dtype
+        found = {k: getattr(after, k).astype(dtype) for k in (*_MOTION, "time", "qacc_warmstart", "sensordata")}
+        return found | {"overflow": after._impl.overflow.reshape(count)}
+
+    def _batched(self, size: int, is_batched: list, given: _Values) -> tuple[_Values, dict]:
+        (flags,) = is_batched
+        whole = {k: x if flags[k] else jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()}
+        found = self._run({k: x.reshape(-1, *x.shape[2:]) for k, x in whole.items()})
+        found = {k: x.reshape(size, -1, *x.shape[1:]) for k, x in found.items()}
+        return found, dict.fromkeys(found, True)
+
+    def _step(self, given: _Values) -> _Values:
+        return {k: x[0] for k, x in self._run({k: x[None] for k, x in given.items()}).items()}
+
+    def _derived(self, primals: tuple, tangents: tuple) -> tuple[_Values, _Values]:
+        (given,), (changes,) = primals, tangents
+        found = self.step(given)
+        names = tuple(k for k in _GIVEN[:8] if given[k].size and not isinstance(changes[k], SymbolicZero))
+        zeros = {
+            k: jnp.zeros_like(x) if eqx.is_inexact_array(x) else np.zeros(x.shape, jax.dtypes.float0)
+            for k, x in found.items()
+        }
+        if not names:
+            return found, zeros
+        parts = [self._to_tangent(given[k], changes[k]) if k == "qpos" else changes[k].reshape(-1) for k in names]
+        moved = jnp.matmul(self.derivative(given, names), jnp.concatenate(parts), precision="highest")
+        sizes = [self.mj_model.nv, self.mj_model.nv, self.mj_model.na]
+        qpos, qvel, act, sensed = jnp.split(moved, np.cumsum(sizes))
+        return found, zeros | {
+            "qpos": self._from_tangent(found["qpos"], qpos), "qvel": qvel, "act": act, "sensordata": sensed,
+        }  # fmt: skip
+
+    def derivative(self, given: _Values, names: tuple[str, ...]) -> Float[Array, "outputs columns"]:
+        """Return the derivative of the next state, in tangent space, and of readings by what is given, by central differences."""
+        given = jax.lax.stop_gradient(given)
+        points, widths = [], []
+        for name in names:
+            size = self.mj_model.nv if name == "qpos" else given[name].size
+            away = (_POSITION if name == "qpos" else _OTHER) * jnp.eye(size, dtype=given["qpos"].dtype)
+            ends = [self._moved(given, name, sign * away) for sign in (1.0, -1.0)]
+            widths.append(self._apart(name, ends[0], ends[1]))
+            points += [
+                {k: jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()} | {name: end} for end in ends
+            ]
+        found = self._run({k: jnp.concatenate([one[k] for one in points]) for k in given})
+        ends = np.cumsum([0] + [len(one["qpos"]) for one in points])
+        columns = []
+        for i, width in enumerate(widths):
+            after, before = ({k: x[ends[j] : ends[j + 1]] for k, x in found.items()} for j in (2 * i, 2 * i + 1))
+            apart = [jax.vmap(self._to_tangent)(before["qpos"], after["qpos"] - before["qpos"])]
+            apart += [after[k] - before[k] for k in ("qvel", "act", "sensordata")]
+            columns.append(jnp.concatenate(apart, axis=1) / width[:, None])
+        return jnp.concatenate(columns).T
+
+    def _moved(self, given: _Values, name: str, changes: Float[Array, "columns size"]) -> Array:
+        if name != "qpos":
+            return given[name] + changes.reshape(-1, *given[name].shape)
+        return jax.vmap(lambda v: integrate_position(self.mj_model, given["qpos"], v, 1.0))(changes)  # pyright: ignore[reportArgumentType]
+
+    def _apart(self, name: str, after: Array, before: Array) -> Float[Array, " columns"]:
+        """Return how far apart points are that were rounded."""
+        if name != "qpos":
+            return jnp.sum((after - before).reshape(len(after), -1), axis=1)
+        return jnp.diagonal(jax.vmap(self._to_tangent)(before, after - before))
+
+    def _to_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
+        """Return a small change of positions in tangent space."""
+        parts = []
+        for run in self._runs:
+            at, moved = (x[run.qpos].reshape(-1, run.width) for x in (qpos, change))
+            if run.width > 1:
+                turn = 2.0 * spatial.multiply(spatial.conjugate(at[:, -4:]), moved[:, -4:])[:, 1:]
+                moved = jnp.concatenate([moved[:, :-4], turn], axis=1)
+            parts.append(moved.reshape(-1))
+        return jnp.concatenate(parts)
+
+    def _from_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+        parts = []
+        for run in self._runs:
+            at = qpos[run.qpos].reshape(-1, run.width)
+            moved = change[run.dofs].reshape(len(at), -1)
+            if run.width > 1:
+                turn = jnp.pad(moved[:, -3:], ((0, 0), (1, 0)))
+                moved = jnp.concatenate([moved[:, :-3], 0.5 * spatial.multiply(at[:, -4:], turn)], axis=1)
+            parts.append(moved.reshape(-1))
+        return jnp.concatenate(parts)
+
+
+@functools.lru_cache(maxsize=16)
+def worlds_of(mj_model: mujoco.MjModel) -> Worlds:
+    """Return the worlds of a C model, which share compiled programs."""
+    return Worlds(mj_model)
+
+
+def _given(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> _Values:
+    found = {name: getattr(scene.data, name) for name in _GIVEN[3:8]} | inputs
+    found |= {name: getattr(state, name) for name in _MOTION}
+    found |= {"ctrl": ctrl, "qacc_warmstart": state.warmstart, "time": state.time}
+    return {name: jnp.asarray(found[name]) for name in _GIVEN}
+
+
+def _step(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> _Values:
+    return worlds_of(scene.mj_model).step(_given(scene, state, ctrl, inputs))
+
+
+def _check(scene: Scene) -> None:
+    """Refuse numbers that are not those of the C model."""
+    if changed := sorted(changed_numbers(scene)):
+        raise SceneError(f"MuJoCo Warp steps the model as it was loaded, got other numbers of {', '.join(changed)}")
