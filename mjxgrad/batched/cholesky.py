@@ -19,10 +19,8 @@ from mjxgrad.batched.linear import add, batch_last, dot, matvec, rmatvec
 
 _Vector = Float[Array, "n *batch"]
 _Matrix = Float[Array, "n n *batch"]
-# Larger factorisations are not written out: compiling them would take longer than they save.
-_LARGEST = 16
-# Least columns of a block and largest number of blocks. 23 columns in six blocks take a third of LAPACK's time, in two blocks
-# nine tenths; each block takes a tenth of a second to compile.
+_LARGEST = 16  # larger factorisations are not written out: compiling them would take longer than they save
+# Least columns of a block and largest number of blocks, each of which takes a tenth of a second to compile.
 _LEAST_BLOCK = 4
 _MOST_BLOCKS = 8
 SOLUTION = "solution"
@@ -50,12 +48,10 @@ def _step_by_step(matrix: Float[Array, "n n batch"], vector: Float[Array, "n bat
 
 @jax.custom_jvp
 def solve_positive_definite(operator: Any, vector: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return matrix⁻¹ vector, differentiable: derivatives are solves too and do not go through the factorisation.
-
-    The operator is a symmetric matrix: `operator.matrix` has its entries, and `operator.apply(x)` is the product, through which
-    derivatives go. Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. The solution has the name
-    `SOLUTION`, by which reverse mode can keep it.
-    """
+    """Return matrix⁻¹ vector, differentiable: derivatives are solves too and do not go through the factorisation."""
+    # The operator is a symmetric matrix: `operator.matrix` has its entries, and `operator.apply(x)` is the product,
+    # through which derivatives go. Under `jax.vmap` the batch is moved to the trailing axis for the factorisation. The
+    # solution has the name `SOLUTION`, by which reverse mode can keep it.
     return batch_last(cholesky_solve)(operator.matrix, vector)
 
 
@@ -70,10 +66,8 @@ def _solve_jvp(primals, tangents):
 
 
 def written_out(matrix: Float[Array, "n n *fewer"], vector: _Vector) -> _Vector:
-    """Return matrix⁻¹ vector by columns; the vector is factored along as one more row.
-
-    Vectors may share a matrix, whose axis then has length one.
-    """
+    """Return matrix⁻¹ vector by columns; the vector is factored along as one more row."""
+    # Vectors may share a matrix, whose axis then has length one.
     columns: list[Array] = []  # columns of the factor, from the diagonal down
     forward: list[Array] = []
     for k in range(len(vector)):

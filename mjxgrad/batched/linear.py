@@ -19,8 +19,7 @@ from mjxgrad.batched import device
 
 _Items = Float[Array, "n *rest"]
 _Matrix = Float[Array, "n n *batch"]
-# Longer sums are matrix products: written out they would take longer to compile than they save.
-LONGEST_SUM = 64
+LONGEST_SUM = 64  # longer sums are matrix products: written out they would take longer to compile than they save
 _SWEEPS = 5  # of Jacobi's rotations; of a matrix of four rows the fifth changes nothing in double precision
 
 
@@ -57,20 +56,16 @@ def diagonal(matrix: _Matrix) -> Float[Array, "n *batch"]:
 
 
 def sum_of_few(terms: Float[Array, "contacts few *rest"]) -> Float[Array, "contacts 1 *rest"]:
-    """Return the sum over the second axis, written out.
-
-    XLA's CPU backend hands such a reduction to a library (YNNPACK) that neither vectorises it over the batch nor, under two
-    `jax.vmap` (jax 0.10.2), always survives it.
-    """
+    """Return the sum over the second axis, written out."""
+    # XLA's CPU backend hands such a reduction to a library (YNNPACK) that neither vectorises it over the batch nor,
+    # under two `jax.vmap` (jax 0.10.2), always survives it.
     return add(terms[:, i : i + 1] for i in range(terms.shape[1]))
 
 
 def batch_last(function: Callable) -> Callable:
-    """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis.
-
-    Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank. The function takes and returns
-    pytrees of arrays.
-    """
+    """Return a function whose `jax.vmap` calls it on arrays with the batch as one more trailing axis."""
+    # Nested batches are merged into one axis, which makes longer vectors and arrays of lower rank. The function takes
+    # and returns pytrees of arrays.
 
     def call(*args: PyTree) -> PyTree:
         # The forward mode of `custom_vmap`, which `jax.hessian` uses, would take None for an array (jax 0.10.2).
@@ -164,11 +159,9 @@ def add_to_diagonal(matrix: _Matrix, chosen: tuple[int, ...], part: Float[Array,
 
 
 def _add_block(x: Array, where: tuple[slice, ...], part: Array) -> Array:
-    """Return x with `part` added to a block.
-
-    A CPU adds in place and touches no other entry. A GPU spends more on starting an operation than on a whole array, and
-    sums many padded blocks in one operation.
-    """
+    """Return x with `part` added to a block."""
+    # A CPU adds in place and touches no other entry. A GPU spends more on starting an operation than on a whole array,
+    # and sums many padded blocks in one operation.
     if part.shape == x.shape:
         return x + part
     if device.is_cpu():
@@ -185,11 +178,9 @@ def add(terms: Iterable[Array]) -> Array:
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Return eigenvalues, in no order, and eigenvectors as columns, by Jacobi's rotations; for up to six rows or so.
 
-    Libraries take one matrix after the other, on a GPU in several kernels that the host waits for. Rotations, entry by entry,
-    are one kernel for thousands of matrices.
-
     Source: Golub and Van Loan, Matrix Computations, section 8.5.
     """
+    # Libraries take one matrix after the other. Rotations, entry by entry, are one kernel for thousands of matrices.
     size = len(matrix)
     if size == 1:
         return matrix[0], jnp.ones_like(matrix)

@@ -1,15 +1,13 @@
-r"""Linear and bilinear maps and Einstein sums of many short vectors: JAX primitives with fast derivatives.
+r"""Linear and bilinear maps and Einstein sums of many short vectors: JAX primitives whose derivatives are sums of the same kind.
 
-Their derivatives are sums of the same kind. JAX's derivative of a slice is a padded array, and sums of many of these make
-reverse mode slow. The derivative of a gather is a scatter, which XLA's CPU backend runs entry by entry.
+JAX's derivative of a slice is a padded array, that of a gather a scatter, which make reverse mode slow.
 
-**On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory. Operations then run along whole vectors of
-states, and each number of a state is contiguous over the batch. XLA propagates layouts, so it suffices that all primitives
-request this one for their inputs and outputs: a hopper's gradient takes less than half the time. A matrix product would need
-the batch first, so Einstein sums are written out.
+**On a CPU** the batch of `jax.vmap`, which JAX puts first, is last in memory, so that operations run along whole vectors of
+states. XLA propagates layouts: it suffices that all primitives request this one. A hopper's gradient takes less than half the
+time. A matrix product would need the batch first, so Einstein sums are written out.
 
-**On a GPU** any operation takes at least a microsecond, and so does a slice of an array with other uses, or the transpose that
-a matrix product needs. There linear and bilinear maps are sums of gathers, which XLA fuses with their neighbours.
+**On a GPU** any operation takes at least a microsecond. There linear and bilinear maps are sums of gathers, which XLA fuses with
+their neighbours.
 
 The norms here have a derivative of zero at zero, where the usual norm has none.
 """
@@ -33,14 +31,10 @@ from jaxtyping import Array, Float, Int
 from mjxgrad.batched import device
 from mjxgrad.batched.linear import LONGEST_SUM, add
 
-# (entry of the result, entry of the first factor, entry of the second, coefficient)
-Term = tuple[int, int, int, float]
-# Longest sum that a GPU gathers; a longer one is a matrix product.
-_MOST_GATHERED = 32
-# Largest total number of terms that are sliced, since each slice is an operation to compile.
-_MOST_SLICED = 96
-# Longest gathered sum that is fused with its inputs, which XLA then computes again for every term.
-_MOST_FUSED = 4
+Term = tuple[int, int, int, float]  # (entry of the result, entry of the first factor, entry of the second, coefficient)
+_MOST_GATHERED = 32  # longest sum that a GPU gathers; a longer one is a matrix product
+_MOST_SLICED = 96  # largest total number of terms that are sliced, since each slice is an operation to compile
+_MOST_FUSED = 4  # longest gathered sum that is fused with its inputs, which XLA then computes again for every term
 
 
 class Bilinear:
@@ -127,11 +121,8 @@ def safe_norm(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     return safe_sqrt(jnp.sum(x * x, axis=-1))
 
 
-# Shared by all primitives. The first `batch` axes of all arrays are those of `jax.vmap`.
-
-
 def _define(name: str, infer: Callable, evaluate: Callable, on_gpu: Callable) -> Primitive:
-    """Return a primitive without its derivative."""
+    """Return a primitive without its derivative; the first `batch` axes of all arrays are those of `jax.vmap`."""
     primitive = Primitive(name)
 
     def batch_last(*factors, batch, **parameters):
@@ -161,17 +152,12 @@ def _batch_last(x: Array, batch: int) -> Array:
     return with_layout_constraint(x, Layout(major_to_minor=(*range(batch, x.ndim), *range(batch))))
 
 
-# The bilinear map.
-
-
 def _ordered(terms: Iterable[Term]) -> tuple[Term, ...]:
-    """Return the terms sorted by entry of the result, added terms before subtracted ones."""
     return tuple(sorted(terms, key=lambda term: (term[0], -term[3], term[1:3])))
 
 
 @functools.cache
 def _transposed(terms: tuple[Term, ...], places: tuple[int, int, int]) -> tuple[Term, ...]:
-    """Return the terms with other places for entries of the result and of the factors."""
     return _ordered(map(operator.itemgetter(*places, 3), terms))
 
 
@@ -210,7 +196,6 @@ def _bilinear_by_gathers(a: Array, b: Array, *, terms: tuple[Term, ...], size: i
 
 
 def _where_terms(total: Array, has_terms: np.ndarray) -> Array:
-    """Return sums, zero where there are no terms."""
     return total if has_terms.all() else jnp.where(has_terms, total, 0.0)
 
 
@@ -235,9 +220,6 @@ _bilinear = _define(
     _bilinear_by_gathers,
 )
 ad.defbilinear(_bilinear, _transpose_first, _transpose_second)
-
-
-# The linear map.
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -329,9 +311,6 @@ _linear = _define("linear", _linear_shape, _linear_by_slices, _linear_by_gathers
 ad.deflinear2(_linear, _transpose_linear)
 
 
-# The Einstein sum.
-
-
 class _Subscripts(NamedTuple):
     """One letter for each axis of both factors and of the result, without the axes of the batch."""
 
@@ -344,7 +323,6 @@ class _Subscripts(NamedTuple):
         return "".join(letter for letter in self.first if letter not in self.result)
 
     def sizes(self, a: Any, b: Any, batch: int) -> dict[str, int]:
-        """Return the length of each letter's axis."""
         return dict(zip(self.first + self.second, (*a.shape[batch:], *b.shape[batch:]), strict=True))
 
 
@@ -355,7 +333,6 @@ def _contract_written_out(a: Array, b: Array, *, subscripts: _Subscripts, batch:
         return _contract_by_product(a, b, subscripts=subscripts, batch=batch)
 
     def at(x: Array, letters: str, place: dict[str, int]) -> Array:
-        """Return the entries at a place of the summed letters, with one axis for each letter of the result."""
         chosen = x[(..., *(place.get(letter, slice(None)) for letter in letters))]
         kept = [letter for letter in letters if letter not in place]
         order = [batch + kept.index(letter) for letter in subscripts.result if letter in kept]

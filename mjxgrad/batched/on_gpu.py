@@ -24,8 +24,7 @@ _Blocks = list[list[Any]]  # 16 by 16, None below the diagonal
 
 # Matrices are eliminated in blocks of so many columns: a program selects a row by a sum over the whole block.
 _BLOCK, _MOST_COLUMNS = 16, 32
-# Number of warps by the largest number of entries of J. Several warps exchange sums through shared memory: on a humanoid
-# with room for 12 contacts (2048 entries) 100 steps take 590 ms with one, 640 with two.
+# Number of warps by the largest number of entries of J. Several warps exchange sums through shared memory.
 _WARPS = {2048: 1, 4096: 2, 8192: 8}
 _MOST_ROWS = 1024
 
@@ -67,11 +66,9 @@ def solve(
     max_shift: float = 0.0,
     interpret: bool = False,
 ) -> tuple[Float[Array, "n batch"], Float[Array, "n batch"]]:
-    """Return (mass + Σ scale left rightᵀ)⁻¹ vector, with the sum over rows, and the diagonal of that matrix.
-
-    The matrix must be symmetric. The solution is not finite where the matrix is not positive definite even with a share of its
-    diagonal below `max_shift` added. The right rows default to the left ones. A row whose scale is zero costs little.
-    """
+    """Return (mass + Σ scale left rightᵀ)⁻¹ vector, with the sum over rows, and the diagonal of that matrix."""
+    # The matrix must be symmetric. The solution is not finite where the matrix is not positive definite even with a share of its
+    # diagonal below `max_shift` added. The right rows default to the left ones. A row whose scale is zero costs little.
 
     def kernel(mass, vector, *refs):
         *refs, solution, on_diagonal = refs
@@ -87,18 +84,16 @@ def solve(
 
 
 def run(
-    kernel: Callable[..., None],
+    kernel: Callable,
     inputs: Sequence[Array],
     outputs: Sequence[tuple[Any, int]],
     num_entries: int = 1,
     *,
     interpret: bool,
 ) -> list[Array]:
-    """Run a program for every state on its part of the inputs, and return the outputs of these types and lengths.
-
-    The inputs are padded with zeros to powers of two, so that one thread reads and keeps neighbours in memory. The program
-    has registers for `num_entries` entries.
-    """
+    """Run a program for every state on its part of the inputs, and return the outputs of these types and lengths."""
+    # The inputs are padded with zeros to powers of two, so that one thread reads and keeps neighbours in memory. The
+    # program has registers for `num_entries` entries.
     # Imported here: only a GPU needs it, and it takes half a second.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
@@ -241,7 +236,6 @@ def _solve(matrix: _Blocks, vector: list[_Part], size: int) -> list[_Part]:
 
 
 def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part:
-    """Return matrix⁻¹ vector by Gauss-Jordan elimination."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
     def eliminate(pivot, carry):
@@ -256,7 +250,6 @@ def _eliminate(matrix: Float[Array, "16 16"], vector: _Part, size: int) -> _Part
 
 
 def _inverse(matrix: Float[Array, "16 16"]) -> Float[Array, "16 16"]:
-    """Return the inverse by Gauss-Jordan elimination."""
     index = jnp.arange(_BLOCK, dtype=jnp.int32)
 
     def eliminate(pivot, entries):

@@ -15,16 +15,9 @@ _PARTS, _LEAST = 8, 8
 
 
 def sparsely(function: Callable, is_wanted: Bool[Array, " n"], each: PyTree, common: PyTree) -> PyTree:
-    """Return a function of each of n things where it is wanted, and zeros elsewhere.
-
-    Under `jax.vmap` the wanted ones of the whole batch are gathered, so that time goes with their number.
-
-    Args:
-        function: a function of one thing and of the common part; it returns a tree of arrays.
-        is_wanted: where its result is wanted.
-        each: the things, with an axis of n in front of all arrays.
-        common: a tree that all share; it may be batched.
-    """
+    """Return a function of each of n things where it is wanted, and zeros elsewhere."""
+    # The function takes one thing and what is common to all, which may be batched, and returns a tree of arrays. Under
+    # `jax.vmap` the wanted ones of the whole batch are gathered, so that time goes with their number.
     traced, known = eqx.partition(common, lambda x: isinstance(x, jax.core.Tracer))
     leaves, form = jax.tree.flatten((each, traced))
 

@@ -20,8 +20,7 @@ CAUSES = {
     *("jnt_pos", "jnt_axis", "qpos0", "site_pos", "tendon_armature", "actuator_gear"),
 }
 _Geom = mujoco.mjtGeom
-# `body_simple` of a childless body on slides along the world's axes: only its mass counts.
-_SLIDING = 2
+_SLIDING = 2  # `body_simple` of a childless body on slides along the world's axes: only its mass counts
 
 
 def set_const(model: mjx.Model) -> mjx.Model:
@@ -41,11 +40,12 @@ def constants_of(model: mjx.Model) -> dict[str, Array]:
     with jax.default_matmul_precision("highest"):
         data = kinematics.up_to_inertia(model, mjx.make_data(model).replace(qpos=model.qpos0))
         mass = mjx.full_m(model, data)
-        inverse = jnp.linalg.inv(mass)
+        inverse, first = jnp.linalg.inv(mass), tree.first_dofs(model)
+        is_same = first[:, None] == first  # of a ball joint, or half of a free joint, over which weights are averaged
         found = {
             "body_subtreemass": jnp.asarray(tree.descendants(model), mass.dtype) @ model.body_mass,
             "body_invweight0": _of_bodies(model, data, inverse),
-            "dof_invweight0": _of_dofs(model, inverse),
+            "dof_invweight0": jnp.asarray(is_same / is_same.sum(axis=1), mass.dtype) @ jnp.diag(inverse),
             "dof_M0": jnp.diag(mass),
             "geom_rbound": bounding_radii(model),
         }
@@ -69,13 +69,6 @@ def _of_bodies(model: mjx.Model, data: mjx.Data, inverse: Float[Array, "nv nv"])
     slides = model.body_simple == _SLIDING
     alone = 1 / jnp.where(slides, model.body_mass, 1.0)
     return jnp.where(slides[:, None], jnp.stack([alone, jnp.zeros_like(alone)], axis=1), weights)
-
-
-def _of_dofs(model: mjx.Model, inverse: Float[Array, "nv nv"]) -> Float[Array, " nv"]:
-    """Return the diagonal of the inverse, averaged over a ball joint and over each half of a free joint."""
-    first = tree.first_dofs(model)
-    is_same = first[:, None] == first
-    return jnp.asarray(is_same / is_same.sum(axis=1), inverse.dtype) @ jnp.diag(inverse)
 
 
 def bounding_radii(model: mjx.Model) -> Float[Array, " ngeom"]:

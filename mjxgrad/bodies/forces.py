@@ -22,7 +22,6 @@ _BIASES = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 def _drives_axes(model: mjx.Model) -> bool:
-    """Return whether all actuators act on hinges and slides."""
     if not np.isin(model.actuator_trntype, _ON_JOINTS).all():
         return False
     return bool(np.isin(model.jnt_type[model.actuator_trnid[:, 0]], _ON_AXES).all())
@@ -52,10 +51,8 @@ def fwd_velocity(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def passive(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute spring and damper forces; a drop-in for `mjx.passive` whose springs are differentiable at rest.
-
-    Gravity compensation and media are left to MJX.
-    """
+    """Compute spring and damper forces; a drop-in for `mjx.passive` whose springs are differentiable at rest."""
+    # Gravity compensation and media are left to MJX.
     flags = model.opt.disableflags
     none = jnp.zeros_like(data.qvel)
     # MJX drops all passive forces where either is disabled.
@@ -84,10 +81,8 @@ def _tendon_forces(model: mjx.Model, data: mjx.Data) -> Float[Array, " tendons"]
 
 
 def fwd_actuation(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute actuator forces; a drop-in for `mjx.fwd_actuation`.
-
-    It computes motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
-    """
+    """Compute actuator forces; a drop-in for `mjx.fwd_actuation`."""
+    # It computes motors and servos without activation dynamics on hinges and slides; other actuators are left to MJX.
     if not model.nu or model.opt.disableflags & _Disable.mjDSBL_ACTUATION:
         return mended.fwd_actuation(model, data)
     if not _is_plain(model):
@@ -120,7 +115,6 @@ def _with_tendon_limits(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _actuated(model: mjx.Model, data: mjx.Data, force: Float[Array, " nu"]) -> mjx.Data:
-    """Return data with clamped actuator forces, and clamped joint forces that result."""
     force = _clamp(force, model.actuator_forcelimited, model.actuator_forcerange)
     total = contract("uv,u->v", data._impl.actuator_moment, force)
     if model.flg_gravcomp:
@@ -133,7 +127,6 @@ def _actuated(model: mjx.Model, data: mjx.Data, force: Float[Array, " nu"]) -> m
 
 
 def _is_plain(model: mjx.Model) -> bool:
-    """Return whether all actuators are motors or servos without dynamics."""
     return bool(
         not model.na
         and not model.flg_gravcomp
@@ -151,10 +144,9 @@ def _clamp(x: Float[Array, " n"], is_limited: np.ndarray, bounds: Float[Array, "
 
 
 def fwd_acceleration(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Sum all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`.
-
-    `xfrc_applied` acts at the bodies' centres of mass (N, N m). Derivatives go through the bodies, not through the entries of M.
-    """
+    """Sum all forces but those of constraints; a drop-in for `mjx.fwd_acceleration`."""
+    # `xfrc_applied` acts at the bodies' centres of mass (N, N m). Derivatives go through the bodies, not through the
+    # entries of M.
     push, torque = data.xfrc_applied[:, :3], data.xfrc_applied[:, 3:]
     lever = data.xipos - pick(model.body_rootid, data.subtree_com)
     wrench = jnp.concatenate([torque + spatial.cross(lever, push), push], axis=1)

@@ -1,11 +1,9 @@
 r"""Kinematics, inertia and bias forces: the smooth stages of a step, without recursion.
 
-MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes.
-No quantity is transformed between bodies, so the usual recursion over the tree becomes a sum over ancestors or descendants:
-a product with a constant 0/1 matrix. Only orientations multiply, see `orientation`.
-
-MJX walks the tree level by level, which is slow in reverse mode. The stages here fill the same fields of `mjx.Data` with the
-same values. One difference is intended: bodies fixed to a mocap body follow it, as in C MuJoCo.
+MuJoCo expresses all spatial quantities of a kinematic tree about one point, the tree's centre of mass, in world axes. So the
+usual recursion over the tree becomes a sum over ancestors or descendants: a product with a constant 0/1 matrix. Only orientations
+multiply, see `orientation`. The stages fill the same fields of `mjx.Data` with the same values as MJX, whose walk over the tree
+is slow in reverse mode. One difference is intended: bodies fixed to a mocap body follow it, as in C MuJoCo.
 
 References:
     Featherstone. Rigid Body Dynamics Algorithms. Springer 2008, chapters 5 and 6.
@@ -158,11 +156,9 @@ def com_vel(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def crb(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute the mass matrix from composite inertias; a drop-in for `mjx.crb`.
-
-    M_ij = cdof_i · I_i cdof_j, with I_i the inertia of all bodies that joint i carries, for j an ancestor of i or i itself. `M`
-    keeps the format of the data, either of MJX's two.
-    """
+    """Compute the mass matrix from composite inertias; a drop-in for `mjx.crb`."""
+    # M_ij = cdof_i · I_i cdof_j, with I_i the inertia of all bodies that joint i carries, for j an ancestor of i or i
+    # itself. `M` keeps the format of the data, either of MJX's two.
     if data._impl.M.ndim == 1:
         return mjx.crb(model, data)
     below = tree.descendants(model)
@@ -196,55 +192,39 @@ def generalised_force(model: mjx.Model, data: mjx.Data, force: Float[Array, "nbo
     return maps.dot(data.cdof, carried)
 
 
-class Bodies(eqx.Module):
-    """The mass matrix as a product over bodies, applied without being formed.
+class Inertia(eqx.Module):
+    """The mass matrix M: its entries and, unless tendons add to it, its bodies, through which derivatives go."""
 
-    M a is computed as in `rne`: sums over ancestors give the bodies' accelerations, their inertias the forces, and sums over
-    descendants the joint forces. The derivative has the same form. `moves` is `tree.moving_dofs`.
-    """
-
-    inertia: Float[Array, "nbody 10 *batch"]
-    axes: Float[Array, "nv 6 *batch"]
-    armature: Float[Array, "nv *batch"]
-    moves: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    # By bodies M a is computed as in `rne`: sums over ancestors give the bodies' accelerations, their inertias the forces, and
+    # sums over descendants the joint forces. The derivative has the same form.
+    matrix: Float[Array, "nv nv *batch"]
+    bodies: Float[Array, "nbody 10 *batch"] | None = None
+    axes: Float[Array, "nv 6 *batch"] | None = None
+    armature: Float[Array, "nv *batch"] | None = None
+    moves: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())  # of `tree.moving_dofs`
 
     def apply(self, acceleration: _Vector) -> _Vector:
-        """Return M a."""
+        if self.bodies is None or self.axes is None:
+            return contract("ij,j->i", self.matrix, acceleration)
         moves = np.array(self.moves)
         motion = combine(moves, maps.scale(acceleration, self.axes))
-        force = spatial.momentum(self.inertia, motion)
+        force = spatial.momentum(self.bodies, motion)
         return maps.dot(self.axes, combine(moves.T, force)) + self.armature * acceleration
 
-
-class Inertia(eqx.Module):
-    """The mass matrix M: its entries and, unless tendons add to it, its bodies. Derivatives go through the bodies."""
-
-    matrix: Float[Array, "nv nv *batch"]
-    bodies: Bodies | None = None
-
-    def apply(self, acceleration: _Vector) -> _Vector:
-        """Return M a."""
-        if self.bodies is None:
-            return contract("ij,j->i", self.matrix, acceleration)
-        return self.bodies.apply(acceleration)
-
     def plus(self, diagonal: _Vector) -> "Inertia":
-        """Return M plus a diagonal matrix."""
-        bodies = None
-        if self.bodies is not None:
-            bodies = dataclasses.replace(self.bodies, armature=self.bodies.armature + diagonal)
-        return Inertia(self.matrix + jnp.diag(diagonal), bodies)
+        armature = None if self.armature is None else self.armature + diagonal
+        return dataclasses.replace(self, matrix=self.matrix + jnp.diag(diagonal), armature=armature)
 
 
 def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
     """Return M of data whose mass matrix is filled in."""
     matrix = mjx.full_m(model, data)
     if model.ntendon or data._impl.M.ndim == 1:
-        # The armature of tendons is not in `Bodies`, and the sparse format is MJX's.
+        # The armature of tendons is not that of bodies, and the sparse format is MJX's.
         return Inertia(matrix)
     moves = tuple(map(tuple, tree.moving_dofs(model).tolist()))
     armature = jnp.asarray(model.dof_armature, matrix.dtype)
-    return Inertia(matrix, Bodies(data._impl.cinert, data.cdof, armature, moves))
+    return Inertia(matrix, data._impl.cinert, data.cdof, armature, moves)
 
 
 def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duration: _Duration) -> _Position:
@@ -262,10 +242,8 @@ def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duratio
 
 
 def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
-    """Return the velocity that moves one position to another in unit time; quaternions take the shorter turn.
-
-    The inverse of `integrate_position`.
-    """
+    """Return the velocity that moves one position to another in unit time; quaternions take the shorter turn."""
+    # The inverse of `integrate_position`.
     parts = []
     for run in tree.joint_runs(model):
         before, after = (x[run.qpos].reshape(-1, run.width) for x in (start, end))

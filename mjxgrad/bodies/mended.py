@@ -1,23 +1,20 @@
 """Copies of MJX's functions with finite derivatives; MJX itself is not changed.
 
-Guards that keep a value finite do not always keep its derivative finite. `x + eps * (x == 0)` lets 1e-21 through, and the
-derivative of a quotient divides by its square, which overflows in single precision. Infinity times the zero of a branch not
-taken is NaN. This module copies the modules that hold such guards, replaces a few functions, and lets the copies call each
-other. Values are MJX's to the bit, except where a guard acts and where the list says otherwise:
+Guards that keep a value finite do not always keep its derivative finite: that of a quotient divides by its square, which
+overflows in single precision. This module copies the modules that hold such guards, replaces a few functions, and lets the copies
+call each other. Values are MJX's to the bit, except where a guard acts and where the list says otherwise:
 
 - `collision_convex`, in `contact.collision`: two quotients, where an edge meets a plane and where a face meets another.
 - `support.muscle_dynamics_timescale`: the smooth switch, a quintic in a quotient by a width that is zero by default.
-- `support.wrap`: tendons on spheres and cylinders, with the values of C MuJoCo. MJX has NaN derivatives where a tendon's end
-  lies on the axis, and on short arcs, whose cosine rounding puts at one. Inside a ring it takes five steps of a search that
-  needs up to twenty.
-- `math.quat_to_axis_angle`: separate axis and angle have no derivative at rest, so servos lost theirs. Rounding differs.
+- `support.wrap`: tendons on spheres and cylinders, with the values of C MuJoCo. MJX has NaN derivatives where a tendon's end lies
+  on the axis, and on short arcs. Inside a ring it takes five steps of a search that needs up to twenty.
+- `math.quat_to_axis_angle`: separate axis and angle have no derivative at rest. Rounding differs.
 - `math.safe_div`, `ray._ray_quad`: the distance along rays that run along a face, or miss a ball, had no derivative.
 - `ray.ray`: it fails in a scene without materials.
 
 A tendon through a ring (its sidesite lies within) bends at the point e of the ring where its path is shortest, unless its
-straight line passes too. With a and b its ends, a/|a - e| + b/|b - e| points along e there. The point is bracketed between
-the limits of both ends' view. Two Newton steps, which are differentiated, give the root with its first and second derivative.
-Within some 0.001 rad of the tendon leaving the ring C MuJoCo gives up and takes the middle of both ends.
+straight line passes too. With a and b its ends, a/|a - e| + b/|b - e| points along e there. The point is bracketed between the
+limits of both ends' view; two Newton steps, which are differentiated, give the root with its first and second derivative.
 """
 
 import importlib.util
@@ -86,10 +83,8 @@ def _cast(ray: Callable, model: mjx.Model, *others: Any, **options: Any) -> Any:
 
 
 def _wrap(wrap_circle: Callable, x0, x1, xpos, xmat, size, side, has_side, is_sphere, is_inside: bool, *_):
-    """Return the length on a geom, -1 where the tendon does not touch it, and its first and last point there.
-
-    A replacement of MJX's `support.wrap`, with its arguments after the first, which is MJX's wrap round a circle in the plane.
-    """
+    """Return the length on a geom, -1 where the tendon does not touch it, and its first and last point there."""
+    # A replacement of MJX's `support.wrap`, with its arguments after the first, which is MJX's wrap round a circle in the plane.
     p0, p1, side = (xmat.T @ (x - xpos) for x in (x0, x1, side))
     if is_inside:
         in_plane = jnp.where(is_sphere, 1.0, jnp.array([1.0, 1.0, 0.0]))
@@ -122,7 +117,6 @@ def _plane(p0: _Point, p1: _Point) -> Float[Array, "2 3"]:
 
 
 def _unit(x: _Point) -> _Point:
-    """Return the direction of a vector; zero stays zero."""
     return spatial.normalise(x[None])[0]
 
 

@@ -1,15 +1,13 @@
 r"""Orientations of bodies: products of turns, or sums of angles where all turns of a chain share one axis.
 
 A turn is the fixed rotation of a body, then the joint's rotation about an axis fixed to the rotated frame. In general
-orientations are products of turns from the root, formed by doubling, in rounds logarithmic in the depth of the tree.
-
-Most legged robots and arms of the benchmarks are planar: all hinges of a chain stay parallel in the world, at any angles. With
-the common axis a the orientation after a turn is
+orientations are products of turns from the root, formed by doubling, in rounds logarithmic in the depth of the tree. Most legged
+robots and arms of the benchmarks are planar. With the common axis a of a chain the orientation after a turn is
 
     R_a(φ) C = cos φ (1 - a aᵀ) C + sin φ [a]ₓ C + a aᵀ C,
 
-where C is the constant product of the fixed rotations and φ the sum of the angles. Each turn then costs one sine and one
-cosine, and no products. Axes and fixed rotations must be known when the program is traced.
+where C is the constant product of the fixed rotations and φ the sum of the angles. Each turn then costs one sine and one cosine,
+and no products. Axes and fixed rotations must be known when the program is traced.
 """
 
 from dataclasses import dataclass
@@ -32,8 +30,7 @@ _Vectors = Float[Array, "n 3"]
 _Matrices = Float[Array, "n 3 3"]
 _Joint = mujoco.mjtJoint
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-# Axes count as parallel up to this many units of rounding.
-_PARALLEL = 16
+_PARALLEL = 16  # axes count as parallel up to this many units of rounding
 
 
 class Products(eqx.Module):
@@ -78,7 +75,6 @@ class Angles(eqx.Module):
         return self._sum(index, *(contract("nij,nj->ni", part, vectors) for part in self._parts(index)))
 
     def _parts(self, index: np.ndarray) -> list[Array]:
-        """Return the factors of the cosine and of the sine, and the constant term."""
         is_turned = (index >= 0)[:, None, None]
         pairs = ((self.chain.even, 0.0), (self.chain.odd, 0.0), (self.chain.constant, np.eye(3)))
         return [jnp.asarray(np.where(is_turned, part[index], rest), self.angle.dtype) for part, rest in pairs]

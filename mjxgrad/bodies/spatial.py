@@ -18,62 +18,37 @@ _Quaternions = Float[Array, "*batch 4"]
 _Matrices = Float[Array, "n 3 3"]
 _Vectors = Float[Array, "n 3"]
 
-# Below this squared angle the truncated series are exact to double precision: the first term left out of either is
-# smaller than (1e-4)**3 / 46080 = 2e-17.
-_SERIES = 1e-4
+_SERIES = 1e-4  # below this squared angle the truncated series are exact to double precision
 # Squared length below which a vector has no direction: its power -3/2 in the derivative must be finite in single precision.
 _NOTHING = 1e-20
-# Entries of a symmetric matrix in MuJoCo's order of an inertia.
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of a symmetric matrix, in MuJoCo's order of an inertia
 
-
-def _quaternion_table() -> np.ndarray:
-    """Return the table of the Hamilton product of (w, x, y, z)."""
-    table = np.zeros((4, 4, 4))
-    table[1:, 1:, 1:] = _CROSS
-    for i in range(4):
-        table[i, 0, i] = table[i, i, 0] = 1
-        table[0, i, i] = 1 if i == 0 else -1
-    return table
-
-
-def _rotation_table() -> np.ndarray:
-    """Return the table of the matrix of v ↦ q v q*; each pair of entries of q occurs once."""
-    conjugate = np.array([1, -1, -1, -1])
-    turned = np.einsum("man,nlb,b->malb", QUATERNION, QUATERNION, conjugate)
-    table = turned[1:, :, 1:].transpose(0, 2, 1, 3).reshape(9, 4, 4)
-    return np.triu(table + np.tril(table, -1).transpose(0, 2, 1))
-
-
-def _motion_table() -> np.ndarray:
-    """Return the table of v × m = (ω × m_ω, ω × m_v + v × m_ω)."""
-    table = np.zeros((6, 6, 6))
-    table[:3, :3, :3] = table[3:, :3, 3:] = table[3:, 3:, :3] = _CROSS
-    return table
-
-
-def _momentum_table() -> np.ndarray:
-    """Return the table of inertia times motion, (I ω + h × v, m v - h × ω), h the mass times its offset."""
-    table = np.zeros((6, 10, 6))
-    for entry, (i, j) in enumerate(_ENTRIES):
-        table[i, entry, j] = table[j, entry, i] = 1
-    table[:3, 6:9, 3:] = _CROSS
-    table[3:, 6:9, :3] = -_CROSS
-    table[3:, 9, 3:] = np.eye(3)
-    return table
-
-
+# Tables of bilinear maps.
 _CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(2, 0, 1)
-QUATERNION = _quaternion_table()
+QUATERNION = np.zeros((4, 4, 4))  # of the Hamilton product of (w, x, y, z)
+QUATERNION[1:, 1:, 1:] = _CROSS
+QUATERNION[range(4), 0, range(4)] = QUATERNION[range(4), range(4), 0] = 1
+QUATERNION[0, range(4), range(4)] = 1, -1, -1, -1
+# The matrix of v ↦ q v q*; each pair of entries of q occurs once.
+_turned = np.einsum("man,nlb,b->malb", QUATERNION, QUATERNION, np.array([1, -1, -1, -1]))
+_turned = _turned[1:, :, 1:].transpose(0, 2, 1, 3).reshape(9, 4, 4)
+_ROTATION = np.triu(_turned + np.tril(_turned, -1).transpose(0, 2, 1))
+_MOTION = np.zeros((6, 6, 6))  # v × m = (ω × m_ω, ω × m_v + v × m_ω)
+_MOTION[:3, :3, :3] = _MOTION[3:, :3, 3:] = _MOTION[3:, 3:, :3] = _CROSS
+_MOMENTUM = np.zeros((6, 10, 6))  # inertia times motion, (I ω + h × v, m v - h × ω), h the mass times its offset
+for _entry, (_i, _j) in enumerate(_ENTRIES):
+    _MOMENTUM[_i, _entry, _j] = _MOMENTUM[_j, _entry, _i] = 1
+_MOMENTUM[:3, 6:9, 3:], _MOMENTUM[3:, 6:9, :3], _MOMENTUM[3:, 9, 3:] = _CROSS, -_CROSS, np.eye(3)
+
 cross = Bilinear(_CROSS)
 """a × b."""
 _multiply = Bilinear(QUATERNION)
-_rotation = Bilinear(_rotation_table())
-cross_motion = Bilinear(_motion_table())
+_rotation = Bilinear(_ROTATION)
+cross_motion = Bilinear(_MOTION)
 """v × motion, the rate of a motion fixed to a body of velocity v."""
-cross_force = Bilinear(-_motion_table().transpose(2, 1, 0))
+cross_force = Bilinear(-_MOTION.transpose(2, 1, 0))
 """v ×* force, the rate of a force fixed to a body of velocity v; -(v ×)ᵀ force."""
-momentum = Bilinear(_momentum_table())
+momentum = Bilinear(_MOMENTUM)
 """Inertia times motion."""
 # |o|² m - o (m o)ᵀ, as entries, from o and m o.
 _steiner = Bilinear(np.array([(i == j) * np.eye(3) - np.outer(np.eye(3)[i], np.eye(3)[j]) for i, j in _ENTRIES]))
@@ -86,11 +61,9 @@ def rotate(matrix: _Matrices, x: _Vectors) -> _Vectors:
 
 @jax.custom_jvp
 def compose(p: _Matrices, q: _Matrices) -> _Matrices:
-    """Return the matrix product, item by item.
-
-    The value is a sum of outer products, which XLA fuses into one loop; its product of small matrices would make a step a tenth
-    longer on a CPU. The derivative is a product, since it takes longer to compile when written out.
-    """
+    """Return the matrix product, item by item."""
+    # The value is a sum of outer products, which XLA fuses into one loop; its product of small matrices would make a
+    # step a tenth longer on a CPU. The derivative is a product, since it takes longer to compile when written out.
     return p[:, :, :1] * q[:, :1] + p[:, :, 1:2] * q[:, 1:2] + p[:, :, 2:] * q[:, 2:]
 
 
@@ -118,10 +91,8 @@ def normalise(q: Float[Array, "n k"]) -> Float[Array, "n k"]:
 
 
 def inertia_about(offset: _Vectors, mass: Float[Array, " n"], central: _Matrices) -> Float[Array, "n 10"]:
-    """Return the inertia about a point: (xx, yy, zz, xy, xz, yz), mass times offset from the point, and mass.
-
-    `central` is the rotational inertia about the centre of mass, in world axes (kg m²).
-    """
+    """Return the inertia about a point: (xx, yy, zz, xy, xz, yz), mass times offset from the point, and mass."""
+    # `central` is the rotational inertia about the centre of mass, in world axes (kg m²).
     moment = scale(mass, offset)
     flat = central.reshape(-1, 9)
     entries = jnp.concatenate([flat[:, ::4], flat[:, 1:3], flat[:, 5:6]], axis=1)

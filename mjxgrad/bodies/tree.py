@@ -97,11 +97,9 @@ def joints_of(model: mjx.Model, body: int) -> range:
 
 
 def displacements(model: mjx.Model) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrices that sum displacements to the positions of bodies and of joint anchors.
-
-    The displacements are, in order: from the parent to each body, from each body to its joints' anchors, and one per joint. The
-    latter is the displacement of a slide, the position of a free joint, or the way back from the anchor to the body.
-    """
+    """Return the matrices that sum displacements to the positions of bodies and of joint anchors."""
+    # The displacements are, in order: from the parent to each body, from each body to its joints' anchors, and one per joint. The
+    # latter is the displacement of a slide, the position of a free joint, or the way back from the anchor to the body.
     num_body, num_joint = model.nbody, model.njnt
     bodies = np.zeros((num_body, num_body + 2 * num_joint))
     anchors = np.zeros((num_joint, num_body + 2 * num_joint))
@@ -129,11 +127,9 @@ def moving_dofs(model: mjx.Model) -> np.ndarray:
 
 
 def earlier_dofs(model: mjx.Model) -> np.ndarray:
-    """Return 1 where a joint velocity (column) moves the axis of another (row), else 0 (nv, nv).
-
-    All joints before an axis move it. The three axes of a ball joint turn with its parent (MuJoCo's convention, not the
-    total derivative). The rotation of a free joint comes after its translation.
-    """
+    """Return 1 where a joint velocity (column) moves the axis of another (row), else 0 (nv, nv)."""
+    # All joints before an axis move it. The three axes of a ball joint turn with its parent (MuJoCo's convention, not
+    # the total derivative). The rotation of a free joint comes after its translation.
     body, dofs = model.dof_bodyid, np.arange(model.nv)
     is_own = (dofs >= model.body_dofadr[body][:, None]) & (dofs < first_dofs(model)[:, None])
     return np.where(is_own, 1.0, moving_dofs(model)[model.body_parentid[body]])

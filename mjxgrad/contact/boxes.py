@@ -1,12 +1,11 @@
 r"""Contacts of two boxes, where C MuJoCo 3.17 has them: up to eight where faces touch, one where edges cross.
 
 - **Which axis.** Boxes overlap unless an axis separates them: a face normal of either, or an edge of one across an edge of the
-  other. Along a unit axis $n$ their separation is $|n·p| - \sum_i h_i |n·a_i|$, with $p$ between the centres. The six axes of
-  both boxes are $a_i$, and $h_i$ is half their length (m). The axis with the largest separation is the contact's normal. Edges
-  have to be better than faces by a millionth of the separation, and by 5 % if they differ by less than 8° from the best face.
-  Parallel edges have no axis.
+  other. Along a unit axis $n$ their separation is $|n·p| - \sum_i h_i |n·a_i|$, with $p$ between the centres, $a_i$ the axes of
+  both and $h_i$ half their length (m). The axis with the largest separation is the contact's normal. Edges have to be better than
+  faces by a millionth of the separation, and by 5 % if they differ by less than 8° from the best face.
 - **Faces.** The box with that normal clips the face of the other box that looks most against it. The corners of what is left are
-  the contacts. Each lies half way between both surfaces along the normal, and its distance is their distance there.
+  the contacts, half way between both surfaces along the normal.
 - **Edges.** The contact is in the middle between the nearest points of both edges, and its distance is along the normal.
 - **Derivatives** are those of these formulas in the branch taken. An edge nearly parallel to a side of the clipping face cuts it
   anywhere: the place of such a cut on its edge is a constant to the derivative.
@@ -38,8 +37,7 @@ _Contacts = tuple[Float[Array, "8"], Float[Array, "8 3"], _Vector]
 _EDGE_BIAS, _ALIKE_BIAS, _ALIKE = 1e-6, 0.05, 0.99
 # Slope of an edge against a side of the clipping face below which the derivative takes their crossing as fixed on the edge.
 _FLAT = 1e-5
-# Slope below which both are parallel: quotients stay finite in single precision.
-_PARALLEL = 1e-30
+_PARALLEL = 1e-30  # slope below which both are parallel: quotients stay finite in single precision
 # The three cyclic permutations: row k of the a-th is the axis after a by k + 1.
 _CYCLES = np.array([np.roll(np.eye(3), -a - 1, axis=0) for a in range(3)])
 _CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
@@ -62,10 +60,8 @@ class _Axis(NamedTuple):
 
 
 def box_box(first: Box, second: Box) -> tuple[Float[Array, "8"], Float[Array, "8 3"], Float[Array, "8 3 3"]]:
-    """Return the contacts of two boxes: distances (m; `ABSENT` in slots that are not used), positions (m), and frames.
-
-    The first rows of frames are normals, which point away from the first box.
-    """
+    """Return the contacts of two boxes: distances (m; `ABSENT` in slots that are not used), positions (m), and frames."""
+    # The first rows of frames are normals, which point away from the first box.
     turn = _product(first.axes.T, second.axes)
     ways = _product(first.axes.T, second.centre - first.centre), _product(second.axes.T, first.centre - second.centre)
     axis = _separating_axis(turn, ways, first.half, second.half)
@@ -111,7 +107,6 @@ def _others(x: _Vector) -> _Matrix:
 
 
 def _faces(first: Box, second: Box, turn: _Matrix, ways: tuple[_Vector, _Vector], axis: _Axis) -> _Contacts:
-    """Return distances, positions and the normal where the axis belongs to a face."""
     is_second = axis.face >= 3
     box, other = (jax.tree.map(lambda x, y: jnp.where(is_second, y, x), *p) for p in ((first, second), (second, first)))
     # Coordinates from here on: two axes of the clipping face, and the height above it.
@@ -135,10 +130,8 @@ def _faces(first: Box, second: Box, turn: _Matrix, ways: tuple[_Vector, _Vector]
 def _clipped(
     middle: _Vector, spans: Float[Array, "2 3"], half: Float[Array, "2"]
 ) -> tuple[Float[Array, "12 3"], Bool[Array, "12"]]:
-    """Return corners of a parallelogram clipped by an upright rectangle, and which of them there are.
-
-    They are on the parallelogram's four edges, where each begins or enters and where it leaves, and at the rectangle's corners.
-    """
+    """Return corners of a parallelogram clipped by an upright rectangle, and which of them there are."""
+    # They are on the parallelogram's four edges, where each begins or enters and where it leaves, and at the rectangle's corners.
     slack = 16 * jnp.finfo(half.dtype).eps
     corners = jnp.asarray(_CORNERS, half.dtype)
     start = middle + _product(corners, spans)
@@ -181,7 +174,6 @@ def _packed(
 
 
 def _edges(first: Box, second: Box, turn: _Matrix, way: _Vector, axis: _Axis) -> _Contacts:
-    """Return distances, positions and the normal where two edges cross."""
     along1, at2 = ((jnp.arange(3) == index).astype(turn.dtype) for index in axis.edges)
     along2 = _product(turn, at2)
     cross = jnp.cross(along1, along2)

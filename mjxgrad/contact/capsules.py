@@ -32,15 +32,10 @@ _Group = Int[np.ndarray, "_ 2"]
 Found = tuple[Float[Array, " contacts"], Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]]
 """Distances, positions and frames."""
 _PLANE, _SPHERE, _CAPSULE = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("PLANE", "SPHERE", "CAPSULE"))
+KINDS = {(first, second) for first in (_PLANE, _SPHERE, _CAPSULE) for second in (_SPHERE, _CAPSULE)}
 # Tilt of an upright axis over rounding, which gives no tangent; square of one over a root of rounding, below small differences:
 # there the tangent turns so fast that its derivative means nothing.
 _UPRIGHT, _NEARLY = 16.0, 0.01
-
-
-def has_formula(key: Any) -> bool:
-    """Return whether this module has a formula for a pair of types."""
-    first, second = key.types
-    return second in (_SPHERE, _CAPSULE) and first in (_PLANE, _SPHERE, _CAPSULE)
 
 
 def find(model: mjx.Model, data: mjx.Data, groups: Mapping[Any, _Group]) -> dict[Any, Found]:
@@ -115,7 +110,6 @@ def _placed(data: mjx.Data, pairs: _Pairs) -> tuple[_Vectors, _Vectors, _Vectors
 
 
 def _sizes(model: mjx.Model, geoms: Int[np.ndarray, " pairs"]) -> tuple[_PerPair, _PerPair]:
-    """Return radii and half-lengths of axes."""
     sizes = pick(geoms, model.geom_size)
     return sizes[:, 0], jnp.where(model.geom_type[geoms] == _CAPSULE, sizes[:, 1], 0.0)
 

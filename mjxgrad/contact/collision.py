@@ -40,8 +40,7 @@ _OF_ROUND = {_SPHERE: 1, _ELLIPSOID: 1, _CAPSULE: 2}
 _SLOTS = {(_BOX, _BOX): boxes.NUM_CONTACTS, (_PLANE, _CYLINDER): 4}  # unlike MJX
 _WITHOUT_BROAD_PHASE = {_PLANE, _HEIGHT_FIELD}
 """Types without a bounding sphere."""
-# Weight of a ball's distance outside an edge: both faces act on it only close to the edge.
-_ROUND_EDGES = 4.0
+_ROUND_EDGES = 4.0  # weight of a ball's distance outside an edge: both faces act on it only close to the edge
 # Length of an edge times a distance from a plane (m²) below which the product is rounding, in either precision.
 _PARALLEL = 1e-12
 # Angle of two edges (rad) below which a face touches: more than single-precision rounding, less than angles seen in motions.
@@ -49,10 +48,8 @@ _ALIGNED = 1e-5
 
 
 def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Fill in the contacts; a drop-in for `mjx.collision`, with the same order of pairs.
-
-    Where data has fewer slots for contacts of one dimension than there could be contacts, the nearest ones get them.
-    """
+    """Fill in the contacts; a drop-in for `mjx.collision`, with the same order of pairs."""
+    # Where data has fewer slots for contacts of one dimension than there could be contacts, the nearest ones get them.
     if not data._impl.ncon:
         return data
     most_pairs = custom_number(model, "max_geom_pairs")
@@ -66,7 +63,11 @@ def collide(model: mjx.Model, data: mjx.Data) -> mjx.Data:
             contacts[key] = nearest = _greatest(contact, -gaps, most_pairs)
             pairs[key] = nearest.geom
     # MJX finds the contacts of pairs that are known only at run time.
-    known = {key: geoms for key, geoms in pairs.items() if isinstance(geoms, np.ndarray) and capsules.has_formula(key)}
+    known = {
+        key: geoms
+        for key, geoms in pairs.items()
+        if isinstance(geoms, np.ndarray) and tuple(key.types) in capsules.KINDS
+    }
     found = capsules.find(model, data, known)
     by_dim: dict[int, list] = {}
     for key, geoms in pairs.items():
@@ -151,12 +152,10 @@ def are(model: mjx.Model, geoms: Array | np.ndarray, kinds: tuple[int, ...]) -> 
 def other_sides(
     model: mjx.Model, data: mjx.Data, contact: Any, geoms: Int[np.ndarray, "contacts 2"] | Array
 ) -> tuple[Any, Float[Array, " contacts"]]:
-    """Return the contact that would replace each one as bodies move on, and by how much the present one is nearer (m).
-
-    Where two centres pass each other along the normal, that is the mirrored contact. For a ball within a box it is the contact
-    with the second nearest face. Outside an edge the components along both faces are exchanged, so that the contact is
-    continuous. Faces of boxes are considered only where the geoms are constants.
-    """
+    """Return the contact that would replace each one as bodies move on, and by how much the present one is nearer (m)."""
+    # Where two centres pass each other along the normal, that is the mirrored contact. For a ball within a box it is
+    # the contact with the second nearest face. Outside an edge the components along both faces are exchanged, so that
+    # the contact is continuous. Faces of boxes are considered only where the geoms are constants.
     towards = pick(geoms[:, 1], data.geom_xpos) - pick(geoms[:, 0], data.geom_xpos)
     pos, frame, nearer = contact.pos, -contact.frame, 2 * jnp.sum(contact.frame[:, 0] * towards, axis=1)
     if isinstance(geoms, np.ndarray):
@@ -215,7 +214,6 @@ _FUNCTIONS = {
 
 
 def _divisor(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return a divisor that is safe where MJX guards only against an exact zero."""
     return jnp.where(jnp.abs(x) >= _PARALLEL, x, 1e-6)
 
 

@@ -25,8 +25,8 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._arrays import is_known_to_be
 from mjxgrad._mjx import mjx
 
-# Halvings of the bracket; a Newton step ends the search.
-_HALVINGS = 50
+_Each = Float[Array, "*shape"]
+_HALVINGS = 50  # halvings of the bracket; a Newton step ends the search
 
 
 class Impedance(eqx.Module):
@@ -43,10 +43,8 @@ def is_square(*solimps: Float[Array | np.ndarray, "_ 5"]) -> bool:
 
 
 def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is_square: bool = False) -> Impedance:
-    """Return d at the violation r (m or rad), which rises from d0 to dw by two power laws that meet at the midpoint.
-
-    `is_square` says that the power is known to be two, MuJoCo's default; a square takes a tenth of the time.
-    """
+    """Return d at the violation r (m or rad), which rises from d0 to dw by two power laws that meet at the midpoint."""
+    # `is_square` says that the power is known to be two, MuJoCo's default; a square takes a tenth of the time.
     smallest = jnp.clip(solimp[..., 0], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     largest = jnp.clip(solimp[..., 1], mujoco.mjMINIMP, mujoco.mjMAXIMP)
     width = jnp.maximum(solimp[..., 2], mujoco.mjMINVAL)
@@ -66,11 +64,9 @@ def impedance(solimp: Float[Array, "*n 5"], violation: Float[Array, "*n"], *, is
 def stiffness_damping(
     model: mjx.Model, solref: Float[Array, "*n 2"], full: Float[ArrayLike, "..."] = 1.0
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Return K (1/s²) and B (1/s) from `full`, the impedance dw; with 1, k = K dw² and b = B dw, independent of dw.
-
-    Each format is evaluated on valid numbers of its own, so that no infinity of the other enters the derivative. Under
-    refsafe the time constant is at least two time steps. At this bound the derivative is that of larger time constants.
-    """
+    """Return K (1/s²) and B (1/s) from `full`, the impedance dw; with 1, k = K dw² and b = B dw, independent of dw."""
+    # Each format is evaluated on valid numbers of its own, so that no infinity of the other enters the derivative. Under refsafe
+    # the time constant is at least two time steps. At this bound the derivative is that of larger time constants.
     first, second = solref[..., 0], solref[..., 1]
     time_constant = jnp.where(first > 0, first, 1.0)
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
@@ -82,13 +78,9 @@ def stiffness_damping(
     return stiffness, damping
 
 
-def rest_depth(
-    acceleration: Float[ArrayLike, "..."], stiffness: Float[Array, "*shape"], solimp: Float[Array, "*shape 5"]
-) -> Float[Array, "*shape"]:
-    r"""Solve for the depth at rest (m) under $c\,a_0$ (m/s²) at stiffness $k$ (1/s²), both positive.
-
-    It is counted from where contact begins, and differentiable by the implicit function theorem.
-    """
+def rest_depth(acceleration: Float[ArrayLike, "..."], stiffness: _Each, solimp: Float[Array, "*shape 5"]) -> _Each:
+    r"""Solve for the depth at rest (m) under $c\,a_0$ (m/s²) at stiffness $k$ (1/s²), both positive."""
+    # It is counted from where contact begins, and differentiable by the implicit function theorem.
     acceleration = jnp.broadcast_to(jnp.asarray(acceleration, stiffness.dtype), stiffness.shape)
     largest = impedance(solimp, jnp.zeros_like(stiffness)).full
     # Beyond the width the impedance is constant, and the depth has a closed form.
@@ -110,23 +102,18 @@ def rest_depth(
     return depth - excess(depth) / jax.lax.stop_gradient(slope)
 
 
-def static_response(depth: Float[Array, "*shape"], solimp: Float[Array, "*shape 5"]) -> Float[Array, "*shape"]:
+def static_response(depth: _Each, solimp: Float[Array, "*shape 5"]) -> _Each:
     r"""Return $d(\rho)^2 \rho / (d_w^2 (1 - d(\rho)))$, which the stiffness turns into an acceleration (m)."""
     profile = impedance(solimp, depth)
     return profile.present**2 * depth / (profile.full**2 * (1 - profile.present))
 
 
 def compensated_stiffness(
-    stiffness: Float[Array, "*shape"],
-    solimp: Float[Array, "*shape 5"],
-    margin: Float[Array, "*shape"],
-    acceleration: Float[ArrayLike, "..."],
-) -> Float[Array, "*shape"]:
-    r"""Return the stiffness at which a contact with a margin rests where it would rest without.
-
-    Without margin the depth at rest is $\rho_0$. With margin $m$ the same place is $m + \rho_0$ below the start of the
-    force, so the stiffness must fall by the ratio of `static_response` at both. For a constant impedance $d$ that
-    is $k' = (1 - d) a_0 / (m + \rho_0)$, in 1/s², never above the given one. `acceleration` is $c\,a_0$ (m/s²).
-    """
+    stiffness: _Each, solimp: Float[Array, "*shape 5"], margin: _Each, acceleration: Float[ArrayLike, "..."]
+) -> _Each:
+    r"""Return the stiffness at which a contact with a margin rests where it would rest without."""
+    # Without margin the depth at rest is $\rho_0$. With margin $m$ the same place is $m + \rho_0$ below the start of
+    # the force, so the stiffness must fall by the ratio of `static_response` at both. For a constant impedance $d$ that
+    # is $k' = (1 - d) a_0 / (m + \rho_0)$, in 1/s², never above the given one. `acceleration` is $c\,a_0$ (m/s²).
     depth = rest_depth(acceleration, stiffness, solimp)
     return stiffness * static_response(depth, solimp) / static_response(depth + margin, solimp)

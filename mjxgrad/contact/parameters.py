@@ -1,11 +1,10 @@
 r"""Pairs of geoms that can touch, and their effective contact parameters.
 
 MuJoCo derives the parameters of a contact from its two geoms (or from an explicit `<pair>`), clamps some of them and reads
-`solref` in either of two formats. Here the effective values are brought to one form, in which pairs can be compared and swept.
-It is the law of `contact.law` with $K = k / d_w^2$ and $B = b / d_w$, $k = \omega_0^2$ the stiffness and $b$ the damping, both
-per unit of the contact's effective mass. At full impedance the contact is the oscillator
-$\ddot r = -k r - b \dot r + (1 - d_w) a_0$, with $a_0$ the acceleration without contact. It rests at depth
-$(1 - d_w) a_0 / k$.
+`solref` in either of two formats. Here the effective values are brought to one form, in which pairs can be compared and swept. It
+is the law of `contact.law` with $K = k / d_w^2$ and $B = b / d_w$, $k = \omega_0^2$ the stiffness and $b$ the damping, both per
+unit of the contact's effective mass. At full impedance the contact is the oscillator $\ddot r = -k r - b \dot r + (1 - d_w) a_0$,
+with $a_0$ the acceleration without contact. It rests at depth $(1 - d_w) a_0 / k$.
 
 References:
     MuJoCo documentation, "Solver parameters" and "Contact parameters".
@@ -33,21 +32,13 @@ _NOWHERE = SimpleNamespace(_impl=SimpleNamespace(contact=SimpleNamespace(dim=Non
 
 @dataclass(frozen=True)
 class ContactPair:
-    """Two geoms that MJX tests for contact.
+    """Two geoms that MJX tests for contact."""
 
-    Attributes:
-        geom1: index of the first geom; MJX orders the two by geom type.
-        geom2: index of the second geom.
-        explicit: index of the `<pair>` that holds the parameters, -1 if the geoms hold them.
-        condim: dimension of the contact: 1, 3, 4 or 6.
-        names: names of the two geoms.
-    """
-
-    geom1: int
-    geom2: int
-    explicit: int
-    condim: int
-    names: tuple[str, str]
+    geom1: int  # index of the first geom; MJX orders the two by geom type
+    geom2: int  # index of the second geom
+    explicit: int  # index of the `<pair>` that holds the parameters, -1 if the geoms hold them
+    condim: int  # dimension of the contact: 1, 3, 4 or 6
+    names: tuple[str, str]  # names of the two geoms
 
     def __str__(self) -> str:
         return " – ".join(self.names)
@@ -57,31 +48,20 @@ Pairs = tuple[ContactPair, ...]
 
 
 class ContactParameters(eqx.Module):
-    r"""Effective contact parameters, one row per pair.
+    r"""Effective contact parameters, one row per pair."""
 
-    Attributes:
-        stiffness: $k = \omega_0^2$, in 1/s².
-        damping: $b$, in 1/s.
-        impedance: $d_0$ and $d_w$.
-        width: penetration over which the impedance rises, in m.
-        friction: two sliding, one torsional (m) and two rolling (m) coefficients.
-        margin: distance at which contact begins, in m.
-        pyramid: $c$ of `contact.law`, the relative compliance of a pyramid's normal direction; 1 for other cones.
-        solref: `solref` as mixed by MuJoCo, before `refsafe` and before formats are resolved.
-        solimp: `solimp` as mixed by MuJoCo, before it is clamped.
-        timestep: time step of the model, in s.
-    """
-
-    stiffness: Float[Array, "*batch pairs"]
-    damping: Float[Array, "*batch pairs"]
-    impedance: Float[Array, "*batch pairs 2"]
-    width: Float[Array, "*batch pairs"]
-    friction: Float[Array, "*batch pairs 5"]
-    margin: Float[Array, "*batch pairs"]
+    stiffness: Float[Array, "*batch pairs"]  # $k = \omega_0^2$, in 1/s²
+    damping: Float[Array, "*batch pairs"]  # $b$, in 1/s
+    impedance: Float[Array, "*batch pairs 2"]  # $d_0$ and $d_w$
+    width: Float[Array, "*batch pairs"]  # penetration over which the impedance rises, in m
+    friction: Float[Array, "*batch pairs 5"]  # two sliding, one torsional (m) and two rolling (m) coefficients
+    margin: Float[Array, "*batch pairs"]  # distance at which contact begins, in m
+    # $c$ of `contact.law`, the relative compliance of a pyramid's normal direction; 1 for other cones.
     pyramid: Float[Array, "*batch pairs"]
+    # `solref` as mixed by MuJoCo, before `refsafe` and before formats are resolved.
     solref: Float[Array, "*batch pairs 2"]
-    solimp: Float[Array, "*batch pairs 5"]
-    timestep: Float[Array, "*batch"]
+    solimp: Float[Array, "*batch pairs 5"]  # `solimp` as mixed by MuJoCo, before it is clamped
+    timestep: Float[Array, "*batch"]  # time step of the model, in s
 
     @property
     def damping_ratio(self) -> Float[Array, "*batch pairs"]:
@@ -115,10 +95,8 @@ def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
 
 
 def contact_pairs(model: mjx.Model | mujoco.MjModel) -> Pairs:
-    """List the pairs of geoms that MJX tests for contact, in no particular order; none if contacts are disabled.
-
-    Only the static structure of the model is read.
-    """
+    """List the pairs of geoms that MJX tests for contact, in no particular order; none if contacts are disabled."""
+    # Only the static structure of the model is read.
     if int(model.opt.disableflags) & _DISABLES_CONTACT:
         return ()
     pairs = []
@@ -128,16 +106,6 @@ def contact_pairs(model: mjx.Model | mujoco.MjModel) -> Pairs:
         condim = model.pair_dim[explicit] if explicit >= 0 else max(dims)
         pairs.append(ContactPair(geom1, geom2, explicit, int(condim), names))
     return tuple(pairs)
-
-
-def named_pairs(pairs: Pairs, wanted: tuple[tuple[str, str], ...], what: str) -> Pairs:
-    """Return the pairs with these names, in the order of `pairs`; refuse unknown names in a message about `what`."""
-    known = {frozenset(pair.names) for pair in pairs}
-    for names in wanted:
-        if frozenset(names) not in known:
-            listed = ", ".join(map(str, pairs[:20])) + " ..." * (len(pairs) > 20) or "none"
-            raise ValueError(f"{what} must name pairs of geoms that can touch, got {names!r}; those that can: {listed}")
-    return tuple(pair for pair in pairs if frozenset(pair.names) in set(map(frozenset, wanted)))
 
 
 def deciding_geoms(model: mjx.Model | mujoco.MjModel, pair: ContactPair) -> tuple[int, ...]:
@@ -153,12 +121,14 @@ def _of_most_priority(model: mjx.Model | mujoco.MjModel, *geoms: int) -> tuple[i
 # Compiled as one program: one operation after another takes seconds for the first scene of a kind.
 @eqx.filter_jit
 def contact_parameters(model: mjx.Model, pairs: Pairs) -> ContactParameters:
-    """Compute the effective parameters of pairs, one row each.
-
-    Differentiable with respect to the model's leaves, and traceable.
-    """
+    """Compute the effective parameters of pairs, one row each."""
+    # Differentiable with respect to the model's leaves, and traceable.
     solref, solimp, friction, margin = _mixed(model, pairs)
-    stiffness, damping = stiffness_damping(model, solref)
+    (stiffness, damping), pyramid = stiffness_damping(model, solref), jnp.ones_like(margin)
+    if model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        condim, square = np.array([pair.condim for pair in pairs], int), friction[:, 0] ** 2
+        factor = square * (1 + square) / (np.maximum(condim - 1, 1) * model.opt.impratio)
+        pyramid = jnp.where(condim > 1, factor, 1.0)
     return ContactParameters(
         stiffness=stiffness,
         damping=damping,
@@ -166,19 +136,11 @@ def contact_parameters(model: mjx.Model, pairs: Pairs) -> ContactParameters:
         width=jnp.maximum(solimp[:, 2], mujoco.mjMINVAL),
         friction=friction,
         margin=margin,
-        pyramid=_pyramid_factor(model, pairs, friction[:, 0]),
+        pyramid=pyramid,
         solref=solref,
         solimp=solimp,
         timestep=jnp.asarray(model.opt.timestep),
     )
-
-
-def _pyramid_factor(model: mjx.Model, pairs: Pairs, friction: Array) -> Array:
-    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
-        return jnp.ones_like(friction)
-    condim = np.array([pair.condim for pair in pairs], dtype=int)
-    factor = friction**2 * (1 + friction**2) / (np.maximum(condim - 1, 1) * model.opt.impratio)
-    return jnp.where(condim > 1, factor, 1.0)
 
 
 def _mixed(model: mjx.Model, pairs: Pairs) -> Iterator[Array]:

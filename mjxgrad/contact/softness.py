@@ -27,7 +27,6 @@ from mjxgrad.contact.parameters import (
     contact_pairs,
     contact_parameters,
     deciding_geoms,
-    named_pairs,
 )
 
 # Plain integers: NumPy's integers do not equal MuJoCo's enumerations.
@@ -98,7 +97,13 @@ class Softness(eqx.Module):
         """
         everything = contact_pairs(model)
         if self.pairs is not None:
-            return named_pairs(everything, self.pairs, "pairs")
+            wanted, there = set(map(frozenset, self.pairs)), {frozenset(pair.names) for pair in everything}
+            if unknown := [names for names in self.pairs if frozenset(names) not in there]:
+                listed = ", ".join(map(str, everything[:20])) + " ..." * (len(everything) > 20) or "none"
+                raise ValueError(
+                    f"pairs must name pairs of geoms that can touch, got {unknown[0]!r}; those that can: {listed}"
+                )
+            return tuple(pair for pair in everything if frozenset(pair.names) in wanted)
         if self.geoms is None:
             return everything
         known = sorted({name for pair in everything for name in pair.names})
@@ -121,11 +126,14 @@ class Softness(eqx.Module):
                 pair that was not selected; if present values to be kept disagree; if a margin is set on a mesh or height
                 field; if a height is to be kept for a contact that already has a margin, without a given stiffness.
         """
-        for name in _REQUIREMENTS:
-            shape = np.shape(getattr(self, name))
+        parts = {}
+        for name, (is_valid, _) in _REQUIREMENTS.items():
+            value, shape = getattr(self, name), np.shape(getattr(self, name))
             if shape and not (name == "impedance" and shape == (2,)):
                 raise ValueError(f"{name} must be one value to be applied, got shape {shape}; sweep under jax.vmap")
-        self = self._with_nan_for_what_is_refused()
+            if isinstance(value, jax.core.Tracer):  # a rollout with NaN is flagged as diverged
+                parts[name] = jnp.where(is_valid(value), value, jnp.nan)
+        self = dataclasses.replace(self, **parts)
         selected = self.selected(model)
         before = contact_parameters(model, selected)
         explicit = {p.explicit: i for i, p in enumerate(selected) if p.explicit >= 0}
@@ -147,15 +155,6 @@ class Softness(eqx.Module):
                 pair_solref=_write(model.pair_solref, explicit, solref),
             )
         return model
-
-    def _with_nan_for_what_is_refused(self) -> "Softness":
-        """Return the softness with NaN in place of traced values out of range, so that a rollout is flagged as diverged."""
-        parts = {}
-        for name, (is_valid, _) in _REQUIREMENTS.items():
-            value = getattr(self, name)
-            if isinstance(value, jax.core.Tracer):
-                parts[name] = jnp.where(is_valid(value), value, jnp.nan)
-        return dataclasses.replace(self, **parts)
 
     def _solref(self, model: mjx.Model, pairs: Pairs, before: ContactParameters) -> Array:
         """Return solref in the direct format for each pair; the model has the other parts already."""
@@ -214,7 +213,6 @@ def _write(values: Array, places: dict[int, int], per_pair: Array) -> Array:
 
 
 def _summed_geoms(pair: ContactPair) -> tuple[int, ...]:
-    """Return the geoms whose margins add up to that of a pair: none if it is explicit."""
     return () if pair.explicit >= 0 else (pair.geom1, pair.geom2)
 
 

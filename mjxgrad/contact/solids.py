@@ -1,20 +1,16 @@
 r"""Contacts of boxes and cylinders with planes, balls and capsules, where C MuJoCo has them. MJX has other rules.
 
 - **A box on a plane** touches with the lower end of each of its four diagonals, so a contact always belongs to the same one.
-  MJX takes corners within 1 mm of the deepest one, and loses others that still touch.
 - **A cylinder on a plane** touches with four points: the lowest point of its lower rim, two more of this rim a third of a turn
-  away, and the lowest point of its upper rim. MJX has no more than three. With $m$ the plane's normal in the cylinder's frame,
-  the lowest points lie towards $-(m_x, m_y)$; of an upright cylinder, which has no lowest point, along its x axis. All are
-  points of the cylinder, so their heights have the derivative of the points, in every pose.
+  away, and the lowest point of its upper rim. With $m$ the plane's normal in the cylinder's frame, the lowest points lie towards
+  $-(m_x, m_y)$; those of an upright cylinder, which has none, along its x axis.
 - **A ball** touches at the point of a box or cylinder nearest to its centre; from inside, at the nearest face.
-  MJX knows the distance from a box only where they overlap, and searches that from a cylinder.
 - **A capsule on a box** touches as two balls on its axis $p + s a$, $|s| \le 1$. The first is where the axis is nearest: an end
-  over a face, or the place nearest to one of the twelve edges. Across an edge along j, with c a point on it,
-  $s = a_\perp·(c - p)_\perp / |a_\perp|^2$ is beside the edge's point $p_j + s a_j$; both are clamped. The second ball is farther
-  along the axis over the box, at the capsule's end or the box's, whichever comes first: from a face to the far side; from an
-  edge over the face at the lower angle; from a corner along an edge within 45°, else the other way over a face. There is none
-  where both ways lead off the box or both into it. Where the axis lies exactly along one of the box, rounding decides on that, in
-  C MuJoCo too, and a place may count twice.
+  over a face, or the place nearest to one of the twelve edges. Across an edge along j, with c a point on it, $s = a_\perp·(c -
+  p)_\perp / |a_\perp|^2$ is beside the edge's point $p_j + s a_j$; both are clamped. The second ball is farther along the axis
+  over the box, at the capsule's end or the box's, whichever comes first: from a face to the far side; from an edge over the face
+  at the lower angle; from a corner along an edge within 45°, else the other way over a face. There is none where both ways lead
+  off the box or both into it. Where the axis lies exactly along one of the box, rounding decides on that.
 
 References:
     MuJoCo's `engine_collision_box.c` (`mjc_CapsuleBox`) and `engine_collision_primitive.c` (`mjc_PlaneCylinder`), from which the
@@ -138,13 +134,7 @@ def largest(x: Float[Array, "pairs k"]) -> Array:
 
 
 def places_on_axis(centre: _Vector, axis: _Vector, half: _Vector) -> tuple[Float[Array, "2"], Bool[Array, "2"]]:
-    """Return where a capsule's two balls are on its axis, between -1 and 1, and which there are.
-
-    Args:
-        centre: the capsule's, in the frame of the box (m).
-        axis: from there to its end (m).
-        half: half the lengths of the box (m).
-    """
+    """Return where a capsule's two balls are on its axis, between -1 and 1, and which there are, in the frame of a box (m)."""
     square = jnp.sum(axis * axis)
     slack = jnp.maximum(_ALIKE, float(jnp.finfo(square.dtype).eps) * square)
     ends = centre + jnp.array([[-1.0], [1.0]], axis.dtype) * axis
@@ -232,18 +222,15 @@ def _from_face(
 
 
 def _on_plane(dist: Float[Array, "pairs n"], points: Float[Array, "pairs n 3"], normal: _Points) -> Found:
-    """Return contacts of points of a body with a plane, half way between both."""
     frame = jnp.repeat(jax.vmap(make_frame)(normal), dist.shape[1], axis=0)
     return dist.reshape(-1), (points - 0.5 * dist[..., None] * normal[:, None]).reshape(-1, 3), frame
 
 
 def _centre_in(data: mjx.Data, geoms: _Pairs) -> _Points:
-    """Return the centre of the first geom in the frame of the second."""
     return _into(data, geoms[:, 1], pick(geoms[:, 0], data.geom_xpos))
 
 
 def _into(data: mjx.Data, geoms: Any, points: _Points) -> _Points:
-    """Return points in the frames of geoms."""
     return contract("pji,pj->pi", pick(geoms, data.geom_xmat), points - pick(geoms, data.geom_xpos))
 
 

@@ -17,13 +17,11 @@ _ABOVE_NOTHING = 1e-6  # m; bodies that hover by less are taken to touch
 
 
 def largest_stable_step(damping_ratio: float, integrator: mujoco.mjtIntegrator) -> float:
-    r"""Return the largest $h \omega_0$ at which a contact at full impedance does not gain energy.
-
-    The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and $\zeta = b / (2 \omega_0)$. Semi-implicit Euler is
-    stable while $h^2 k + 2 h b < 4$, that is up to $2 (\sqrt{1 + \zeta^2} - \zeta)$; `implicitfast` treats contact in the same
-    way. RK4 is stable while its amplification factor at both eigenvalues is at most 1. The limit of $h b$ is $2 \zeta$ times
-    the result.
-    """
+    r"""Return the largest $h \omega_0$ at which a contact at full impedance does not gain energy."""
+    # The oscillator $\ddot r = -k r - b \dot r$ has $\omega_0 = \sqrt k$ and $\zeta = b / (2 \omega_0)$. Semi-implicit
+    # Euler is stable while $h^2 k + 2 h b < 4$, that is up to $2 (\sqrt{1 + \zeta^2} - \zeta)$; `implicitfast` treats
+    # contact in the same way. RK4 is stable while its amplification factor at both eigenvalues is at most 1. The
+    # limit of $h b$ is $2 \zeta$ times the result.
     if integrator != mujoco.mjtIntegrator.mjINT_RK4:
         # The difference of two large numbers, in a form that does not cancel.
         return 2.0 / (np.sqrt(1.0 + damping_ratio**2) + damping_ratio)
@@ -60,11 +58,9 @@ def contact_warnings(model: mjx.Model, pairs: Pairs) -> list[str]:
 def steepest(
     stiffness: float, damping: float, impedance: Float[np.ndarray, "2"] | tuple[float, float], width: float
 ) -> tuple[float, float]:
-    r"""Return stiffness and damping at the largest impedance, which is at first touch if it falls with depth.
-
-    The arguments hold at full depth (1/s², 1/s). The force is the share $d(r)$ of the reference acceleration, so stiffness
-    scales with the square of the impedance and damping with the impedance. Without a width the impedance is $d_w$ everywhere.
-    """
+    r"""Return stiffness and damping at the largest impedance, which is at first touch if it falls with depth."""
+    # The arguments hold at full depth (1/s², 1/s). The force is the share $d(r)$ of the reference acceleration, so stiffness
+    # scales with the square of the impedance and damping with the impedance. Without a width the impedance is $d_w$ everywhere.
     share = max(1.0, float(impedance[0] / impedance[1])) if width > mujoco.mjMINVAL else 1.0
     return float(share**2 * stiffness), float(share * damping)
 
@@ -138,7 +134,6 @@ def _hovering(softness: Softness, model: mjx.Model, pairs: Pairs) -> Iterator[tu
 
 
 def _grouped(found: Iterable[tuple[ContactPair, str]]) -> list[str]:
-    """Return one sentence for all pairs with the same message."""
     messages: dict[str, list[ContactPair]] = {}
     for pair, text in found:
         messages.setdefault(text, []).append(pair)

@@ -1,23 +1,19 @@
 r"""Laws of the constraint rows: cost, force and curvature as functions of x = J a - a_ref.
 
-Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope bounded by the loss), then limits and
-contacts (½D min(x, 0)²), where an elliptic contact couples its rows in three zones. With u = (μx₀, f₁x₁, ...), N = u₀,
-T = |u₁..|:
+Rows come in MuJoCo's order: equality (½Dx²), friction loss (Huber, slope bounded by the loss), then limits and contacts (½D
+min(x, 0)²), where an elliptic contact couples its rows in three zones. With u = (μx₀, f₁x₁, ...), N = u₀, T = |u₁..|:
 
 - top, N ≥ μT: no cost;
 - bottom, μN + T ≤ 0: ½ Σ D x²;
-- middle: ½ D₀ (N - μT)² / (μ²(1 + μ²)), whose curvature in u is the sum of two positive parts,
-  (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T (I - ττᵀ), τ the unit tangent. The middle zone meets T = 0 only at the apex, and
-  (μT - N)/T is at most μ + 1/μ there, so nothing needs clamping and the curvature is never indefinite.
+- middle: ½ D₀ (N - μT)² / (μ²(1 + μ²)), whose curvature in u is the sum of two positive parts, (1, -μτ)(1, -μτ)ᵀ and μ(μT - N)/T
+  (I - ττᵀ), τ the unit tangent. (μT - N)/T is at most μ + 1/μ, so nothing needs clamping.
 
-Rows under noise (see `smoothing`) have the mean of these costs, at x + c w over noise w on the distance, where it makes
-contact. The mean of ½ min(x, 0)² is convex in x, with the derivative -`_mean_violation`. A cone's cost is the sum of two such
-terms, of which the second vanishes in the middle and both at the top,
+Rows under noise (see `smoothing`) have the mean of these costs, at x + c w over noise w on the distance. The mean of ½ min(x, 0)²
+is convex in x, with the derivative -`_mean_violation`. A cone's cost is the sum of two such terms,
 
-    ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)).
+    ½ k min(N - μT, 0)² + ½ k min(μN + T, 0)²,        k = D₀ / (μ²(1 + μ²)),
 
-Noise shifts N by μcw, so each term is the simple one with a spread of its own. At T = 0 their tangential forces cancel. Arrays
-may carry the batch as trailing axes, see `linear`.
+each with a spread of its own, since noise shifts N by μcw. Arrays may carry the batch as trailing axes, see `linear`.
 
 References:
     Todorov. Convex and analytically-invertible dynamics with contacts and constraints: Theory and implementation in
@@ -25,10 +21,11 @@ References:
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mjxgrad.batched.linear import add, sum_of_few
 from mjxgrad.solver.noise import KERNELS, Kernel
@@ -37,6 +34,7 @@ _PerRow = Float[Array, "rows *batch"]
 _PerContact = Float[Array, "contacts *batch"]
 _Directions = Float[Array, "contacts dim *batch"]
 _Columns = Float[Array, "contacts dim columns *batch"]
+_Law = tuple[Callable[[_PerRow], _Directions], Callable[[_Columns], _Columns]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +114,7 @@ def force(layout: RowLayout, rows: Rows, x: _PerRow) -> _PerRow:
         noisy = slice(layout.hard_stop, layout.simple_stop)
         parts.append(rows.weight[noisy] * _mean_violation(layout.kernel, x[noisy], _noise_at(rows, noisy))[0])
     for k in range(len(layout.cones)):
-        parts.append(_cone(layout, k, rows, x).force(linear).reshape(-1, *x.shape[1:]))
+        parts.append(_cone(layout, k, rows, x)[0](linear).reshape(-1, *x.shape[1:]))
     return jnp.concatenate([part for part in parts if part.shape[0]])
 
 
@@ -141,7 +139,7 @@ def hessian(layout: RowLayout, rows: Rows, x: _PerRow) -> RowHessian:
     for k, group in enumerate(layout.cones):
         unit = jnp.eye(group.dim, dtype=x.dtype).reshape(1, group.dim, group.dim, *(1,) * (x.ndim - 1))
         unit = jnp.broadcast_to(unit, (group.count, group.dim, group.dim, *x.shape[1:]))
-        cones.append(_cone(layout, k, rows, x).curvature_product(unit))
+        cones.append(_cone(layout, k, rows, x)[1](unit))
     return RowHessian(_simple_curvature(layout, rows, x), tuple(cones))
 
 
@@ -161,7 +159,7 @@ def curvature_product(
     """Return the second derivative of the cost with respect to x, times a matrix."""
     parts = [_simple_curvature(layout, rows, x)[:, None] * matrix[: layout.simple_stop]]
     for k, group in enumerate(layout.cones):
-        both = _cone(layout, k, rows, x).curvature_product(_blocks(group, matrix))
+        both = _cone(layout, k, rows, x)[1](_blocks(group, matrix))
         parts.append(both.reshape(-1, *matrix.shape[1:]))
     return jnp.concatenate(parts, axis=0)
 
@@ -179,97 +177,79 @@ def _simple_curvature(layout: RowLayout, rows: Rows, x: _PerRow) -> Float[Array,
     return jnp.concatenate([curvature, rows.weight[noisy] * probability])
 
 
-class _Cone(eqx.Module):
-    """An elliptic group in the coordinates u, with its zones."""
-
-    group: ConeGroup = eqx.field(static=True)
-    weight: _PerRow
-    scale: _Directions
-    tangent: Float[Array, "contacts tangents *batch"]
-    slip: _PerContact
-    gap: _PerContact
-    stiffness: _PerContact
-    is_middle: Bool[Array, "contacts *batch"]
-    is_bottom: Bool[Array, "contacts *batch"]
-
-    def force(self, linear: _PerRow) -> _Directions:
-        press = jnp.where(self.is_middle, -self.stiffness * self.gap, 0.0)
-        slide = -(press * self.scale[:, 0])[:, None] * self.tangent
-        middle = self.scale * jnp.concatenate([press[:, None], slide], axis=1)
-        return jnp.where(self.is_bottom[:, None], _blocks(self.group, linear), middle)
-
-    def curvature_product(self, block: _Columns) -> _Columns:
-        scaled = self.scale[:, :, None] * block
-        mu = self.scale[:, 0]
-        along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * self.tangent], axis=1)
-        ratio = jnp.where(self.is_middle, -self.gap / jnp.where(self.slip > 0, self.slip, 1.0), 0.0)
-        first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
-        slide = sum_of_few(self.tangent[:, :, None] * scaled[:, 1:])
-        across = scaled[:, 1:] - self.tangent[:, :, None] * slide
-        second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
-        middle = (self.stiffness[:, None] * self.scale)[:, :, None] * (first + second)
-        bottom = _blocks(self.group, self.weight)[:, :, None] * block
-        zone = jnp.where(self.is_middle[:, None, None], middle, 0.0)
-        return jnp.where(self.is_bottom[:, None, None], bottom, zone)
-
-
-class _NoisyCone(eqx.Module):
-    """An elliptic group under noise: the two terms of its cost in the coordinates u."""
-
-    scale: _Directions
-    stiffness: _PerContact
-    tangential: Float[Array, "contacts tangents *batch"]
-    slip: _PerContact
-    violations: tuple[_PerContact, _PerContact]
-    shares: tuple[_PerContact, _PerContact]
-    hold: _PerContact
-
-    def force(self, _: _PerRow) -> _Directions:
-        press = self.violations[0] + self.scale[:, 0] * self.violations[1]
-        both = jnp.concatenate([press[:, None], -self.hold[:, None] * self.tangential], axis=1)
-        return self.stiffness[:, None] * self.scale * both
-
-    def curvature_product(self, block: _Columns) -> _Columns:
-        scaled = self.scale[:, :, None] * block
-        mu = self.scale[:, :1, None]
-        tangent = (self.tangential / jnp.where(self.slip > 0, self.slip, 1.0)[:, None])[:, :, None]
-        slide = sum_of_few(tangent * scaled[:, 1:])
-        first = self.shares[0][:, None, None] * (scaled[:, :1] - mu * slide)
-        second = self.shares[1][:, None, None] * (mu * scaled[:, :1] + slide)
-        across = self.hold[:, None, None] * (scaled[:, 1:] - tangent * slide)
-        along = tangent * (second - mu * first)
-        both = jnp.concatenate([first + mu * second, along + across], axis=1)
-        return (self.stiffness[:, None] * self.scale)[:, :, None] * both
-
-
-def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Cone | _NoisyCone:
+def _cone(layout: RowLayout, which: int, rows: Rows, x: _PerRow) -> _Law:
+    """Return the force of an elliptic group, a function of -D x, and the product of its curvature and columns."""
     group, scale = layout.cones[which], rows.scales[which]
     u = _blocks(group, x) * scale
     square = sum_of_few(u[:, 1:] ** 2)[:, 0]
     slides = square > 1e-24  # m²/s⁴; less is rest, without a direction whose derivative could overflow
     slip = jnp.where(slides, jnp.sqrt(jnp.where(slides, square, 1.0)), 0.0)
-    mu, normal = scale[:, 0], u[:, 0]
+    mu = scale[:, 0]
     stiffness = rows.weight[group.start : group.stop : group.dim] / (mu**2 * (1 + mu**2))
-    if layout.first_noisy is None:
-        is_top = normal >= mu * slip
-        is_bottom = ~is_top & (mu * normal + slip <= 0)
-        tangent = u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
-        gap, is_middle = normal - mu * slip, ~is_top & ~is_bottom
-        return _Cone(group, rows.weight, scale, tangent, slip, gap, stiffness, is_middle, is_bottom)
-    noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
+    if layout.first_noisy is not None:
+        noise = _noise_at(rows, slice(group.start, group.stop, group.dim))
+        return _noisy_cone(layout.kernel, noise, scale, u, slip, stiffness)
+    normal, tangent = u[:, 0], u[:, 1:] / jnp.where(slides, slip, 1.0)[:, None]
+    is_top, gap = normal >= mu * slip, normal - mu * slip
+    is_bottom = ~is_top & (mu * normal + slip <= 0)
+    is_middle = ~is_top & ~is_bottom
+
+    def force(linear: _PerRow) -> _Directions:
+        press = jnp.where(is_middle, -stiffness * gap, 0.0)
+        slide = -(press * mu)[:, None] * tangent
+        middle = scale * jnp.concatenate([press[:, None], slide], axis=1)
+        return jnp.where(is_bottom[:, None], _blocks(group, linear), middle)
+
+    def product(block: _Columns) -> _Columns:
+        scaled = scale[:, :, None] * block
+        along = jnp.concatenate([jnp.ones_like(mu)[:, None], -mu[:, None] * tangent], axis=1)
+        ratio = jnp.where(is_middle, -gap / jnp.where(slip > 0, slip, 1.0), 0.0)
+        first = along[:, :, None] * sum_of_few(along[:, :, None] * scaled)
+        slide = sum_of_few(tangent[:, :, None] * scaled[:, 1:])
+        across = scaled[:, 1:] - tangent[:, :, None] * slide
+        second = jnp.concatenate([jnp.zeros_like(scaled[:, :1]), (mu * ratio)[:, None, None] * across], axis=1)
+        middle = (stiffness[:, None] * scale)[:, :, None] * (first + second)
+        bottom = _blocks(group, rows.weight)[:, :, None] * block
+        return jnp.where(is_bottom[:, None, None], bottom, jnp.where(is_middle[:, None, None], middle, 0.0))
+
+    return force, product
+
+
+def _noisy_cone(
+    kernel: Kernel, noise: Noise, scale: _Directions, u: _Directions, slip: _PerContact, stiffness: _PerContact
+) -> _Law:
+    """Return the same under noise, from the two terms of the cost in the coordinates u."""
+    mu, normal, tangential = scale[:, 0], u[:, 0], u[:, 1:]
     first = Noise(mu * noise.spread, mu * noise.gate)
     second = Noise(mu * first.spread, mu * first.gate)
-    violation1, share1 = _mean_violation(layout.kernel, normal - mu * slip, first)
-    violation2, share2 = _mean_violation(layout.kernel, mu * normal + slip, second)
-    # The tangential force per slip. At small slip the two terms nearly cancel. There the mean of the derivative over the
-    # slip is taken instead, by the trapezoidal rule: its second-order error equals rounding at the cube root of eps.
-    still = _mean_violation(layout.kernel, normal, first)[1]
-    smallest = (12 * jnp.finfo(x.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
+    violation1, share1 = _mean_violation(kernel, normal - mu * slip, first)
+    violation2, share2 = _mean_violation(kernel, mu * normal + slip, second)
+    # The tangential force per slip. At small slip the two terms nearly cancel. There the mean of the derivative over the slip is
+    # taken instead, by the trapezoidal rule: its second-order error equals rounding at the cube root of eps.
+    still = _mean_violation(kernel, normal, first)[1]
+    smallest = (12 * jnp.finfo(u.dtype).eps) ** (1 / 3) * jnp.minimum(noise.spread, second.spread)
     is_small = slip < smallest
     moving = (mu * violation1 - violation2) / jnp.where(is_small, 1.0, slip)
-    resting = 0.5 * (mu**2 * (share1 + still) + share2 + still)
-    hold = jnp.where(is_small, resting, moving)
-    return _NoisyCone(scale, stiffness, u[:, 1:], slip, (violation1, violation2), (share1, share2), hold)
+    hold = jnp.where(is_small, 0.5 * (mu**2 * (share1 + still) + share2 + still), moving)
+
+    def force(_: _PerRow) -> _Directions:
+        press = violation1 + mu * violation2
+        both = jnp.concatenate([press[:, None], -hold[:, None] * tangential], axis=1)
+        return stiffness[:, None] * scale * both
+
+    def product(block: _Columns) -> _Columns:
+        scaled = scale[:, :, None] * block
+        ratio = scale[:, :1, None]
+        tangent = (tangential / jnp.where(slip > 0, slip, 1.0)[:, None])[:, :, None]
+        slide = sum_of_few(tangent * scaled[:, 1:])
+        one = share1[:, None, None] * (scaled[:, :1] - ratio * slide)
+        other = share2[:, None, None] * (ratio * scaled[:, :1] + slide)
+        across = hold[:, None, None] * (scaled[:, 1:] - tangent * slide)
+        along = tangent * (other - ratio * one)
+        both = jnp.concatenate([one + ratio * other, along + across], axis=1)
+        return (stiffness[:, None] * scale)[:, :, None] * both
+
+    return force, product
 
 
 def _blocks(group: ConeGroup, x: Float[Array, "rows *rest"]) -> Float[Array, "contacts dim *rest"]:
@@ -282,11 +262,9 @@ def _noise_at(rows: Rows, which: slice) -> Noise:
 
 
 def _mean_violation(kernel: Kernel, x: _PerRow, noise: Noise) -> tuple[_PerRow, _PerRow]:
-    """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force.
-
-    Above the gate the acceleration ends the force before the distance does, and the mean is the softened ramp. Below the
-    gate the distance alone decides: the probability keeps its value at the gate, and the mean continues along its tangent.
-    """
+    """Return the mean of max(-x - c w, 0) where noise makes contact, and minus its slope, the probability of a force."""
+    # Above the gate the acceleration ends the force before the distance does, and the mean is the softened ramp. Below the gate
+    # the distance alone decides: the probability keeps its value at the gate, and the mean continues along its tangent.
     held = jnp.where(x > noise.gate, x, noise.gate)
     near = held / noise.spread
     probability = kernel.share(near)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjxgrad.batched import cholesky, device, linear, on_gpu
 from mjxgrad.solver.constraint import RowHessian, RowLayout
-from mjxgrad.solver.jacobian import Group, RowMap, as_rows, dense, edges, flat, fold
+from mjxgrad.solver.jacobian import Group, Piece, RowMap, as_rows, dense, edges, flat, fold
 
 _Vector = Float[Array, "nv *batch"]
 _Matrix = Float[Array, "nv nv *batch"]
@@ -30,8 +30,7 @@ MAX_SHIFT = 0.01
 class SparseRows(eqx.Module):
     """The entries of a Jacobian, group by group, without those that are always zero."""
 
-    pieces: tuple[Float[Array, "_ _ _ *batch"], ...]  # entries by item, direction and joint velocity
-    friction: tuple[Float[Array, "_ _ *batch"] | None, ...]  # μ of each tangent of a pyramid; None for other rows
+    pieces: tuple[Piece, ...]
     groups: tuple[Group, ...] = eqx.field(static=True)
     num_dofs: int = eqx.field(static=True)
 
@@ -42,17 +41,17 @@ class SparseRows(eqx.Module):
             cones = [(g.num, g.dim) for g in rows.groups if g.dim > 1 and not g.is_pyramid]
             rows = as_rows(rows.matrix(num_dofs), cones)
         pieces, start = [], 0
-        for group, entries in zip(rows.groups, rows.directions(), strict=True):
+        for group, (entries, mu) in zip(rows.groups, rows.pieces(), strict=True):
             active = is_active[start : start + group.num_rows].reshape(group.num, group.rows_each, *is_active.shape[1:])
             active = active[:, :1] if group.is_pyramid else active
-            pieces.append(jnp.where(active[:, :, None], entries, 0.0))
+            pieces.append((jnp.where(active[:, :, None], entries, 0.0), mu))
             start += group.num_rows
-        return cls(tuple(pieces), tuple(rows.friction_by_group()), rows.groups, num_dofs)
+        return cls(tuple(pieces), rows.groups, num_dofs)
 
     def matvec(self, x: Float[Array, "nv *batch"]) -> Float[Array, "rows *batch"]:
         """Return J x."""
         rows = []
-        for group, entries, mu in zip(self.groups, self.pieces, self.friction, strict=True):
+        for group, (entries, mu) in zip(self.groups, self.pieces, strict=True):
             moving = linear.take(x, group.dofs)
             along = entries[:, :, 0] * moving[:, None] if group.is_diagonal else _over_dofs(entries, moving)
             rows.append(edges(along, mu).reshape(group.num_rows, *x.shape[1:]))
@@ -61,7 +60,7 @@ class SparseRows(eqx.Module):
     def rmatvec(self, force: Float[Array, "rows *batch"]) -> Float[Array, "nv *batch"]:
         """Return Jᵀ force."""
         total, start = jnp.zeros((self.num_dofs, *force.shape[1:]), force.dtype), 0
-        for group, entries, mu in zip(self.groups, self.pieces, self.friction, strict=True):
+        for group, (entries, mu) in zip(self.groups, self.pieces, strict=True):
             own = force[start : start + group.num_rows].reshape(group.num, group.rows_each, *force.shape[1:])
             start += group.num_rows
             force_along = fold(own, mu)
@@ -72,7 +71,7 @@ class SparseRows(eqx.Module):
     def gram(self, mass: _Matrix, layout: RowLayout, row_hessian: RowHessian) -> _Matrix:
         """Return mass + Jᵀ s'' J with s'' from `constraint.hessian`; each group adds only to the block of its dofs."""
         total, start = mass, 0
-        for group, entries, mu in zip(self.groups, self.pieces, self.friction, strict=True):
+        for group, (entries, mu) in zip(self.groups, self.pieces, strict=True):
             rows = slice(start, start + group.num_rows)
             start = rows.stop
             if rows.start >= layout.simple_stop:
@@ -93,11 +92,10 @@ class SparseRows(eqx.Module):
         """Return J with its zeros, without the rows that act on one joint velocity each."""
         # The barrier keeps XLA from computing an entry again for every edge.
         pieces = jax.lax.optimization_barrier(self.pieces)
-        chosen = [one for one in zip(self.groups, pieces, self.friction, strict=True) if not one[0].is_diagonal]
+        chosen = [one for one in zip(self.groups, pieces, strict=True) if not one[0].is_diagonal]
         if not chosen:
-            return jnp.zeros((0, self.num_dofs, *pieces[0].shape[3:]), pieces[0].dtype)
-        groups, entries, friction = (list(of) for of in zip(*chosen, strict=True))
-        return dense(groups, entries, friction, self.num_dofs)
+            return jnp.zeros((0, self.num_dofs, *pieces[0][0].shape[3:]), pieces[0][0].dtype)
+        return dense(*zip(*chosen, strict=True), self.num_dofs)
 
     def split(self, x: Float[Array, "rows *batch"]) -> tuple[Array, ...]:
         """Return the values of the rows in `dense_rows`, then those of each other group by joint velocity."""
@@ -113,7 +111,7 @@ class SparseRows(eqx.Module):
     def signs(self) -> tuple[Float[Array, "nv *batch"], ...]:
         """Return the entries of rows that act on one joint velocity each, one array by joint velocity per group."""
         pairs = zip(self.groups, self.pieces, strict=True)
-        return tuple(self._by_dof(group, entries[:, 0, 0]) for group, entries in pairs if group.is_diagonal)
+        return tuple(self._by_dof(group, entries[:, 0, 0]) for group, (entries, _) in pairs if group.is_diagonal)
 
     def _by_dof(self, group: Group, own: Float[Array, "num *batch"]) -> Float[Array, "nv *batch"]:
         return linear.add_at(jnp.zeros((self.num_dofs, *own.shape[1:]), own.dtype), group.dofs, own)
@@ -150,21 +148,18 @@ def _keeps_groups(rows: RowMap) -> bool:
 
 
 def _gram(left: _Entries, right: _Entries) -> _Square:
-    """Return leftᵀ right."""
     if left.ndim == 3 or left.shape[0] * left.shape[1] > linear.LONGEST_SUM:
         return jnp.einsum("ri...,rj...->ij...", flat(left), flat(right), precision="highest")
     return linear.add(a[:, None] * b[None] for a, b in zip(_rows(left), _rows(right), strict=True))
 
 
 def _over_dofs(entries: _Entries, x: Float[Array, "dofs *batch"]) -> Float[Array, "num dim *batch"]:
-    """Return entries x."""
     if entries.ndim == 3 or len(x) > linear.LONGEST_SUM:
         return linear.matvec(flat(entries), x).reshape(*entries.shape[:2], *x.shape[1:])
     return linear.add(entries[:, :, k] * one for k, one in enumerate(x))
 
 
 def _over_rows(entries: _Entries, force: Float[Array, "num dim *batch"]) -> Float[Array, "dofs *batch"]:
-    """Return entriesᵀ force."""
     if entries.ndim == 3 or entries.shape[0] * entries.shape[1] > linear.LONGEST_SUM:
         return linear.rmatvec(flat(entries), flat(force))
     return linear.add(a * f for a, f in zip(_rows(entries), _rows(force), strict=True))
@@ -199,11 +194,9 @@ def _cone_product(layout: RowLayout, row_hessian: RowHessian, rows: slice, entri
 def solve(
     mass: _Matrix, jacobian: SparseRows, layout: RowLayout, row_hessian: RowHessian, vector: _Vector, shift: float = 0.0
 ) -> tuple[_Vector, _Vector]:
-    """Return (M + Jᵀ s'' J)⁻¹ vector, non-finite where the matrix is not positive definite, and the matrix's diagonal.
-
-    At an impedance near 1, s'' may exceed M so far that M is lost in single precision. Then the smallest share of the
-    diagonal below `shift` that suffices is added, which makes the step shorter.
-    """
+    """Return (M + Jᵀ s'' J)⁻¹ vector, non-finite where the matrix is not positive definite, and the matrix's diagonal."""
+    # At an impedance near 1, s'' may exceed M so far that M is lost in single precision. Then the smallest share of the
+    # diagonal below `shift` that suffices is added, which makes the step shorter.
 
     def step_by_step(mass, jacobian, row_hessian, vector):
         hessian = jacobian.gram(mass, layout, row_hessian)

@@ -4,15 +4,10 @@ At the minimum g(a, p) = M a - f_smooth - Jᵀ f(J a - a_ref) = 0 for all parame
 
     da = -H⁻¹ (∂g/∂p) dp,        H = ∂g/∂a = M + Jᵀ s'' J.
 
-This is the exact derivative of the converged solve. The iterations are not differentiated, and the warm start has no
-effect. The rule is linear in dp, so it serves forward mode and, transposed, reverse mode. It calls the solve itself, so
-derivatives of any order nest. One more Newton step with fixed H would be shorter, but its second derivative is wrong and
-gives no warning, since H and a do not move with p there.
-
-The residual g is evaluated without forming M and J: M a is the force that accelerates the bodies, J a the relative
-acceleration of two bodies. Reverse mode then passes through a few vectors per body and contact, not through a derivative of
-J. Only the solve and the factorisation of H need entries. The acceleration has a name for `jax.checkpoint`, see
-`cholesky.SOLUTION`.
+This is the exact derivative of the converged solve. The rule is linear in dp, so it serves forward mode and, transposed, reverse
+mode. It calls the solve itself, so derivatives of any order nest. (Of one more Newton step with fixed H the second derivative is
+wrong.) The residual g is evaluated without forming M and J, so that reverse mode passes through a few vectors per body and
+contact. The acceleration has a name for `jax.checkpoint`, see `cholesky.SOLUTION`.
 """
 
 import functools
@@ -65,11 +60,9 @@ def solve_both(
     start: _Vector,
     tolerance: _Scalar,
 ) -> tuple[Float[Array, "2 nv"], Int[Array, ""]]:
-    """Solve two variants of a system; a CPU solves the second only where it differs from the first.
-
-    Elsewhere the second solution is the first, and its derivative, which is zero, must not be used. The larger number of
-    iterations is returned.
-    """
+    """Solve two variants of a system; a CPU solves the second only where it differs from the first."""
+    # Elsewhere the second solution is the first, and its derivative, which is zero, must not be used. The larger
+    # number of iterations is returned.
     of_batch = linear.batch_last(functools.partial(newton.minimise, layout, max_iterations))
     if not device.is_cpu():  # a GPU solves all of them sooner than those that need it
         both, counts = jax.vmap(lambda v: of_batch(system.with_variant(v), start, tolerance))(variants)
@@ -106,10 +99,8 @@ def _solve_both_jvp(layout, max_iterations, primals, tangents):
 def solve_linearised(
     layout: RowLayout, system: System, row_hessian: RowHessian, force: _Vector, is_needed: _Truth | None = None
 ) -> _Vector:
-    """Return (M + Jᵀ S J)⁻¹ force for a curvature S of the rows; differentiable, and linear in the force.
-
-    The result is zero where it is not needed.
-    """
+    """Return (M + Jᵀ S J)⁻¹ force for a curvature S of the rows; differentiable, and linear in the force."""
+    # The result is zero where it is not needed.
 
     def apply(x: _Vector) -> _Vector:
         return system.inertia.apply(x) + system.rmv(constraint.hessian_product(layout, row_hessian, system.mv(x)))

@@ -21,8 +21,11 @@ from mjxgrad.bodies import spatial
 
 _PerRow = Float[Array, " rows"]
 _Vector = Float[Array, " nv"]
-# Largest growth of a Hessian's entries when neighbouring contacts are joined in one group.
-_WASTE = 2.0
+Piece = tuple[Float[Array, "_ _ _ *batch"], Float[Array, "_ _ *batch"] | None]
+"""Entries by item, direction and joint velocity; μ of each tangent of a pyramid, None for other rows."""
+Side = tuple[float, tuple[int, ...]]
+"""One of a contact's two bodies: its sign, 1 for the second, and the joint velocities that move it and not the other."""
+_WASTE = 2.0  # largest growth of a Hessian's entries when neighbouring contacts are joined in one group
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,16 +64,12 @@ class RowMap(eqx.Module):
         """Return Jᵀ f."""
 
     @abc.abstractmethod
-    def directions(self) -> Sequence[Float[Array, "num dim dofs *batch"]]:
-        """Return the entries, one array per group; a pyramid has those of its directions."""
-
-    def friction_by_group(self) -> Sequence[Float[Array, "num tangents *batch"] | None]:
-        """Return μ of each tangent of a pyramid, one array per group; None for other rows."""
-        return [None] * len(self.groups)
+    def pieces(self) -> Sequence[Piece]:
+        """Return the entries of each group; of a pyramid those of its directions, and μ of each tangent."""
 
     def matrix(self, num_dofs: int) -> Float[Array, "rows nv *batch"]:
         """Return J."""
-        return dense(self.groups, self.directions(), self.friction_by_group(), num_dofs)
+        return dense(self.groups, self.pieces(), num_dofs)
 
 
 class DenseRows(RowMap):
@@ -90,11 +89,8 @@ class DenseRows(RowMap):
     def rmv(self, force):
         return contract("idv,id->v", self.entries, fold(force.reshape(len(self.entries), -1), self.friction))
 
-    def directions(self):
-        return [self.entries]
-
-    def friction_by_group(self):
-        return [self.friction]
+    def pieces(self):
+        return [(self.entries, self.friction)]
 
 
 class AxisRows(RowMap):
@@ -114,19 +110,8 @@ class AxisRows(RowMap):
     def rmv(self, force):
         return combine(np.eye(self.num_dofs)[:, list(self.dofs)], self.sign * force)
 
-    def directions(self):
-        return [self.sign[:, None, None]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Side:
-    """One of the two bodies of a contact: its sign, 1 for the second body, and the joint velocities that move it alone.
-
-    Joint velocities that move both bodies do not act on a contact.
-    """
-
-    sign: float
-    dofs: tuple[int, ...]
+    def pieces(self):
+        return [(self.sign[:, None, None], None)]
 
 
 class ContactRows(RowMap):
@@ -140,7 +125,7 @@ class ContactRows(RowMap):
     frame: Float[Array, "contacts 3 3 *batch"]  # normal and tangents
     axes: Float[Array, "nv 6 *batch"]  # motions of unit joint velocities
     friction: Float[Array, "contacts tangents *batch"] | None  # μ of a pyramid's tangents, with the edges n ± μ t
-    sides: tuple[tuple[Side, ...], ...] = eqx.field(static=True)
+    sides: tuple[tuple[Side, ...], ...] = eqx.field(static=True)  # of each contact
     dim: int = eqx.field(static=True)
 
     @property
@@ -149,15 +134,13 @@ class ContactRows(RowMap):
         return tuple(Group(dofs, stop - start, self.dim, has_edges) for start, stop, dofs in self._runs())
 
     def _runs(self) -> list[tuple[int, int, tuple[int, ...]]]:
-        """Return runs of neighbouring contacts with common dofs: (first, one after the last, dofs).
-
-        Every run costs some operations, and every column that one contact of a run does not need is wasted. So contacts
-        are joined while that no more than doubles the entries of the Hessian.
-        """
+        """Return runs of neighbouring contacts with common dofs: (first, one after the last, dofs)."""
+        # Every run costs some operations, and every column that one contact of a run does not need is wasted. So
+        # contacts are joined while that no more than doubles the entries of the Hessian.
         runs: list[tuple[int, int, tuple[int, ...], int]] = []
         for contact, sides in enumerate(self.sides):
             # A contact of bodies at rest keeps a column of zeros.
-            dofs = {dof for side in sides for dof in side.dofs} or {0}
+            dofs = {dof for _, own in sides for dof in own} or {0}
             least = len(dofs) ** 2
             if runs:
                 start, _, others, least_others = runs[-1]
@@ -173,8 +156,8 @@ class ContactRows(RowMap):
         chosen = self.sides[contacts]
         moves = np.zeros((len(chosen), len(chosen[0]), self.axes.shape[0]))
         for contact, sides in enumerate(chosen):
-            for place, side in enumerate(sides):
-                moves[contact, place, list(side.dofs)] = side.sign
+            for place, (sign, own) in enumerate(sides):
+                moves[contact, place, list(own)] = sign
         return moves[..., list(dofs)]
 
     def _all_moves(self) -> np.ndarray:
@@ -206,8 +189,9 @@ class ContactRows(RowMap):
         wrench = jnp.concatenate([torque, force_at_point], axis=1)
         return maps.dot(self.axes, combine(self._all_moves().T, wrench))
 
-    def directions(self):
-        return [self._entries(slice(start, stop), dofs) for start, stop, dofs in self._runs()]
+    def pieces(self):
+        runs = [(slice(start, stop), dofs) for start, stop, dofs in self._runs()]
+        return [(self._entries(at, dofs), None if self.friction is None else self.friction[at]) for at, dofs in runs]
 
     def _entries(self, contacts: slice, dofs: tuple[int, ...]) -> Float[Array, "num dim dofs *batch"]:
         frame, axes = self.frame[contacts], linear.take(self.axes, dofs)
@@ -224,9 +208,6 @@ class ContactRows(RowMap):
                 rows = jnp.concatenate([rows, _along(twists, axes[:, :3])], axis=1)
             parts.append(moves[:, side, None] * rows)
         return linear.add(parts)
-
-    def friction_by_group(self):
-        return [None if self.friction is None else self.friction[start:stop] for start, stop, _ in self._runs()]
 
 
 class JoinedRows(RowMap):
@@ -255,11 +236,8 @@ class JoinedRows(RowMap):
             total, start = total + part.rmv(force[start:stop]), stop
         return total
 
-    def directions(self):
-        return [piece for part in self.parts for piece in part.directions()]
-
-    def friction_by_group(self):
-        return [mu for part in self.parts for mu in part.friction_by_group()]
+    def pieces(self):
+        return [piece for part in self.parts for piece in part.pieces()]
 
 
 def as_rows(matrix: Float[Array, "rows nv *batch"], cones: Sequence[tuple[int, int]]) -> JoinedRows:
@@ -270,15 +248,10 @@ def as_rows(matrix: Float[Array, "rows nv *batch"], cones: Sequence[tuple[int, i
     return JoinedRows(tuple(DenseRows(x.reshape(*size, *x.shape[1:])) for x, size in pairs if len(x)))
 
 
-def dense(
-    groups: Sequence[Group],
-    pieces: Sequence[Float[Array, "_ _ _ *batch"]],
-    friction: Sequence[Float[Array, "_ _ *batch"] | None],
-    num_dofs: int,
-) -> Float[Array, "rows nv *batch"]:
+def dense(groups: Sequence[Group], pieces: Sequence[Piece], num_dofs: int) -> Float[Array, "rows nv *batch"]:
     """Return J from its entries, group by group."""
     rows = []
-    for group, entries, mu in zip(groups, pieces, friction, strict=True):
+    for group, (entries, mu) in zip(groups, pieces, strict=True):
         if group.is_diagonal:
             selection = np.eye(num_dofs)[list(group.dofs)]
             own = entries[:, 0] * selection.reshape(*selection.shape, *(1,) * (entries.ndim - 3))
@@ -314,18 +287,15 @@ def flat(x: Float[Array, "num dim *rest"]) -> Float[Array, "rows *rest"]:
 def _along(
     parts: list[Float[Array, "n k *batch"]], axes: Float[Array, "dofs entries *batch"]
 ) -> Float[Array, "n k dofs *batch"]:
-    """Return the products of vectors, given entry by entry, with axes.
-
-    The sum is written out over separate entries: XLA's CPU backend runs along the batch only where nothing is
-    concatenated. (It also crashed on the derivative of the reduction under two `jax.vmap`, jax 0.10.2.)
-    """
+    """Return the products of vectors, given entry by entry, with axes."""
+    # The sum is written out over separate entries: XLA's CPU backend runs along the batch only where nothing is
+    # concatenated. (It also crashed on the derivative of the reduction under two `jax.vmap`, jax 0.10.2.)
     return linear.add(part[:, :, None] * axes[:, i] for i, part in enumerate(parts))
 
 
 def _spread(
     entries: Float[Array, "num dim dofs *batch"], dofs: tuple[int, ...], num_dofs: int
 ) -> Float[Array, "num dim nv *batch"]:
-    """Return the entries, with zeros for all other joint velocities."""
     if len(dofs) == num_dofs:
         return entries
     columns, at = [], 0

@@ -6,14 +6,12 @@ Minimise over a
 
 with the laws s_i of `constraint`. The problem is strictly convex: the start affects the time taken, not the solution.
 
-**Line search.** Along a line the derivative of the cost is monotone and, without elliptic rows and noise, piecewise linear.
-Newton's method inside a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. (Values at all
-breakpoints take rows² work: three times slower at 24 rows.) Near the apex of an elliptic cone the curvature holds on one side
-only. The minimiser may lie at a thousandth of the Newton step there, so its loop checks every step.
+Along a line the derivative of the cost is monotone and, without elliptic rows and noise, piecewise linear. Newton's method inside
+a bracket then ends at the exact minimiser, after as many steps as it crosses pieces. Near the apex of an elliptic cone the
+curvature holds on one side only, so its loop checks every step.
 
-**Convergence.** The solve ends by the Newton decrement gᵀ H⁻¹ g, the remaining step in the norm of kinetic energy. It does
-not depend on the units of joints or on the ratios of masses. The gradient is formed anew in each iteration: in single precision
-an update along the line would keep rounding errors from a poor start.
+The solve ends by the Newton decrement gᵀ H⁻¹ g, the remaining step in the norm of kinetic energy, which does not depend on units
+or ratios of masses. In single precision an update of the gradient along the line would keep rounding errors: it is formed anew.
 """
 
 import dataclasses
@@ -42,26 +40,18 @@ _Result = tuple[_Vector, Int[Array, "*batch"]]
 
 # Newton steps along the search line for the whole batch: testing whether they are needed takes as long as the steps.
 _LINE_STEPS = 4
-# Bound on all steps. Halving alone reaches 1e-12 of the bracket; at most 25 steps were seen.
-_MAX_LINE_STEPS = 40
-# A line search has converged where the slope has fallen to this part of its value at the start. On 512 stiff elliptic
-# problems 0.1, 0.01 and 0.001 took the same number of outer iterations.
-_LINE_TOLERANCE = 1e-2
+_MAX_LINE_STEPS = 40  # bound on all steps; halving alone reaches 1e-12 of the bracket
+_LINE_TOLERANCE = 1e-2  # a line search has converged where the slope has fallen to this part of its value
 # Next lengths keep this share of the bracket as distance from its upper end, where the slope is known to be positive.
 _LINE_MARGIN = 0.01
-# A batch is iterated as a whole until one part in so many is left. Of 256 states of two sliding bodies the slowest takes 5.0
-# iterations in the mean over steps, the average one 1.3. The second loop lengthens compilation by a fifth (a hopper's
-# gradient) to a third (elliptic cones), too much for smaller batches.
+# A batch is iterated as a whole until one part in so many is left: the slowest of 256 states takes four times the average. The
+# second loop takes too long to compile for smaller batches.
 _SHARE = 8
 _LEAST_BATCH = 256
-# Rounding error of a sum of a few terms, in units of rounding.
-_ROUNDING = 4
-# The estimate of rounding omits cancellation within M a and J a. On a humanoid in single precision the decrement falls in one
-# iteration from 10⁷ times the estimate to 5 to 70 times it, and then stays there. Below this multiple the step is the last
-# one: only rounding is left after it.
+_ROUNDING = 4  # rounding error of a sum of a few terms, in units of rounding
+# The estimate of rounding omits cancellation within M a and J a. Below this multiple of it only rounding is left after a step.
 _LAST = 1e3
-# A solve has failed where rounding leaves this share of the acceleration unknown.
-_RESOLVED = 1e-3
+_RESOLVED = 1e-3  # a solve has failed where rounding leaves this share of the acceleration unknown
 
 
 class Variant(eqx.Module):
@@ -128,7 +118,6 @@ class Problem(eqx.Module):
     layout: RowLayout = eqx.field(static=True)
 
     def mass_mv(self, acceleration: _Vector) -> _Vector:
-        """Return M a."""
         return linear.matvec(self.mass, acceleration)
 
     def mv(self, acceleration: _Vector) -> _OfRows:
@@ -163,10 +152,8 @@ class Problem(eqx.Module):
         return Point(acceleration, x, row_force, inertia, constraint_force, inertia - self.force - constraint_force)
 
     def rounding(self, point: "Point") -> _Scalar:
-        """Return the rounding error of the decrement at a point.
-
-        An error e of a row's x adds Jᵀ D e to the gradient, which is large for stiff rows, but at most e D e to the decrement.
-        """
+        """Return the rounding error of the decrement at a point."""
+        # An error e of a row's x adds Jᵀ D e to the gradient, which is large for stiff rows, but at most e D e to the decrement.
 
         def energy(x: Array, reference: Array, force: Array, weight: Array) -> Array:
             size = jnp.abs(x) + jnp.abs(reference)
@@ -177,11 +164,9 @@ class Problem(eqx.Module):
         return (_ROUNDING * jnp.finfo(terms.dtype).eps) ** 2 * terms
 
     def is_resolved(self, point: "Point") -> _Truth:
-        """Return whether rounding leaves less than a thousandth of the acceleration unknown.
-
-        In single precision it leaves more where rows weigh 10⁷ times the bodies. The edges of a pyramid, with weights of
-        1/μ², do so at low friction.
-        """
+        """Return whether rounding leaves less than a thousandth of the acceleration unknown."""
+        # In single precision it leaves more where rows weigh 10⁷ times the bodies. The edges of a pyramid, with
+        # weights of 1/μ², do so at low friction.
         own, free = linear.dot(point.acceleration, point.inertia), linear.dot(self.force / self.diagonal, self.force)
         return self.rounding(point) <= _RESOLVED**2 * (own + free)
 
@@ -199,12 +184,10 @@ class _KernelRows(NamedTuple):
 
 
 class _KernelProblem(Problem):
-    """A problem of uncoupled rows whose M and J a GPU's program keeps in registers.
+    """A problem of uncoupled rows whose M and J a GPU's program keeps in registers."""
 
-    Quantities of the rows come in parts: one for the rows of J, and one by joint velocity for each group of rows that act on
-    a single one, such as limits. As rows of J, whose number is a power of two, they would double it.
-    """
-
+    # Quantities of the rows come in parts: one for the rows of J, and one by joint velocity for each group of rows that
+    # act on a single one, such as limits. As rows of J, whose number is a power of two, they would double it.
     signs: tuple[Float[Array, " width"], ...]  # entries of the rows that act on one joint velocity
     refs: tuple[Any, Any]  # M and J in memory
     size: int = eqx.field(static=True)
@@ -228,8 +211,6 @@ class _KernelProblem(Problem):
         return jax.tree.map(clipped, x, *self.rows[1:])
 
     def curvature(self, x: _Parts) -> _Parts:
-        """Return the second derivative of the cost by x."""
-
         def curvature(x: Array, weight: Array, low: Array, high: Array) -> Array:
             force = -weight * x
             return jnp.where((force > low) & (force < high), weight, 0.0)
@@ -269,27 +250,21 @@ class Point(eqx.Module):
 
 
 class _Iterate(eqx.Module):
-    """The loop's carry.
+    """The loop's carry."""
 
-    Convergence is tested on the carry: a carried array is computed once and stored, while XLA would repeat the sums that form
-    it wherever they are used. (The Hessian is not carried: its blocks are added in place, and the last one is not needed.)
-    """
-
+    # Convergence is tested on the carry: a carried array is computed once and stored, while XLA would repeat the sums that form
+    # it wherever they are used. (The Hessian is not carried: its blocks are added in place, and the last one is not needed.)
     point: Point
     is_near: _Truth
     num_iterations: Int[Array, "*batch"]
 
 
 def minimise(layout: RowLayout, max_iterations: int, system: System, start: _Vector, tolerance: _Scalar) -> _Result:
-    """Return the acceleration of least cost, NaN where the problem is not finite, and the number of iterations.
-
-    The loop runs until every member of the batch is done; members that are done stay where they are. The last eighth is taken
-    out and finished on its own. A start that is not finite is replaced by zero.
-
-    The tolerance bounds the remaining step, in the norm of kinetic energy over the trace of the mass matrix; for a single
-    body this is the root mean square error of its acceleration (m/s²). The search also ends where the step is rounding. The
-    number is `max_iterations` + 1 where the iterations, or the digits of the precision, did not suffice.
-    """
+    """Return the acceleration of least cost, NaN where the problem is not finite, and the number of iterations."""
+    # The loop runs until every member of the batch is done; members that are done stay where they are. The tolerance bounds the
+    # remaining step, in the norm of kinetic energy over the trace of the mass matrix; for a single body this is the root mean
+    # square error of its acceleration (m/s²). The search also ends where the step is rounding. The number is `max_iterations` + 1
+    # where the iterations, or the digits of the precision, did not suffice.
     start = jnp.where(jnp.all(jnp.isfinite(start), axis=0), start, jnp.zeros_like(start))
     if start.ndim == 2 and layout.is_piecewise_quadratic and on_gpu.holds(num_dense_rows(system.map), len(start)):
         solvers = (functools.partial(solver, layout, max_iterations) for solver in (in_one_kernel, _over_batch))
@@ -301,8 +276,8 @@ def in_one_kernel(
     layout: RowLayout,
     max_iterations: int,
     system: System,
-    start: Float[Array, "nv batch"],
-    tolerance: Float[Array, " batch"],
+    start: _Vector,
+    tolerance: _Scalar,
     *,
     interpret: bool = False,
 ) -> _Result:
@@ -349,10 +324,8 @@ def _over_batch(layout: RowLayout, max_iterations: int, system: System, start: _
 
 
 def _finish(solver: "_Solver", state: _Iterate, is_left: Bool[Array, " batch"], result: _Result, count: int) -> _Result:
-    """Finish the remaining members on their own, so that the others need not wait for the slowest.
-
-    The subset has `count` places, at least as many as members are left.
-    """
+    """Finish the remaining members on their own, so that the others need not wait for the slowest."""
+    # The subset has `count` places, at least as many as members are left.
     index, place = jnp.flatnonzero(is_left, size=count, fill_value=0), jnp.cumsum(is_left) - 1
 
     def take(whole: PyTree) -> PyTree:  # an axis of length one stays, as all members share it
@@ -431,11 +404,9 @@ class _Solver(eqx.Module):
 
 
 class _Search(eqx.Module):
-    """A bracket of the minimiser along a line: the cost falls up to `low`, and rises from `high` on.
+    """A bracket of the minimiser along a line: the cost falls up to `low`, and rises from `high` on."""
 
-    `length` is the next length to evaluate, and the minimiser once the slope was flat at the last one.
-    """
-
+    # `length` is the next length to evaluate, and the minimiser once the slope was flat at the last one.
     low: _Scalar
     high: _Scalar
     length: _Scalar
@@ -443,10 +414,8 @@ class _Search(eqx.Module):
 
 
 def _line_search(problem: Problem, point: Point, direction: _Vector, noise: _Scalar, is_done: _Truth) -> _Scalar:
-    """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers the cost.
-
-    `noise` is the rounding error of the slope. The result is not used for members that are done.
-    """
+    """Return the minimiser of the cost along a descent direction from a point, or a shorter step that lowers the cost."""
+    # `noise` is the rounding error of the slope. The result is not used for members that are done.
     along = problem.mv(direction)
     smooth_slope = linear.dot(direction, point.inertia - problem.force)
     smooth_curvature = linear.dot(direction, problem.mass_mv(direction))
@@ -478,11 +447,9 @@ def _dot(one: PyTree, other: PyTree) -> _Scalar:
 
 
 def _until_exact(improve: Callable[[_Search], _Search], search: _Search) -> _Search:
-    """Improve a fixed number of times, then until every slope is flat, where the next length is the minimiser.
-
-    A fixed number alone may fail: under a foot that is pressed hard a step can be a hundred times too long. Then four lengths
-    all lie beyond the minimiser, the last one raises the cost, and the iteration cycles.
-    """
+    """Improve a fixed number of times, then until every slope is flat, where the next length is the minimiser."""
+    # A fixed number alone may fail: under a foot that is pressed hard a step can be a hundred times too long. Then four
+    # lengths all lie beyond the minimiser, the last one raises the cost, and the iteration cycles.
     is_done, num_looks = search.is_flat, 0
     least = _LINE_STEPS if is_done.ndim else 0  # one state's own loop ends with its search
     if not device.is_cpu() and is_done.ndim:

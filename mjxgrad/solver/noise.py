@@ -8,8 +8,7 @@ Read backwards, a force at a distance $F$ that deep inside runs along $-s\,r$ is
 if $F$ is convex and asymptotic to that ramp. An impedance that rises with depth is not convex; a margin shifts a ramp.
 
 All densities are even. Distances are in units of the *length*, the standard deviation of the Gaussian. The others are scaled to
-its mean $|w|$, and so to the same force at the surface, $S(0) = \mathbb{E}|w| / 2 = 1 / \sqrt{2\pi}$. Standard deviations
-could not be matched, since the log barrier's is infinite.
+its mean $|w|$, and so to the same force at the surface, $S(0) = 1 / \sqrt{2\pi}$.
 
 | kernel | softened ramp | density | standard deviation | far away |
 |---|---|---|---|---|
@@ -17,13 +16,12 @@ could not be matched, since the log barrier's is infinite.
 | `logistic` | $\beta\,\mathrm{softplus}(-r/\beta)$, $\beta = 0.576$ | logistic | $\pi \beta / \sqrt 3 = 1.044$ | $e^{-r/\beta}$ |
 | `log_barrier` | $(-r + \sqrt{r^2 + 4/\kappa}) / 2$, $\kappa = 2\pi$ | Student's t, 2 degrees of freedom | infinite | $1 / r$ |
 
-The ramp is the $f \ge 0$ that minimises $f^2/2 + f r$. With the barrier $-\log(f)/\kappa$ in place of the bound, the minimiser is
-the log barrier's $S(r)$, whose density is $2\sqrt\kappa / (4 + \kappa w^2)^{3/2}$.
+The ramp is the $f \ge 0$ that minimises $f^2/2 + f r$; with the barrier $-\log(f)/\kappa$ in place of the bound, the minimiser is
+the log barrier's $S(r)$.
 
 References:
     Pang, Suh, Yang, Tedrake. Global Planning for Contact-Rich Manipulation via Local Smoothing of Quasi-dynamic
-    Contact Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing of contact, and the log barrier as
-    an analytic one).
+    Contact Models. IEEE Transactions on Robotics 2023, arXiv:2206.10787 (randomised smoothing, and the log barrier).
 """
 
 import dataclasses
@@ -49,19 +47,12 @@ _TAIL_DEGREE = {4: 10, 8: 24}
 
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    """A distribution of noise, and the mean force of a contact under it; static, since it shapes the compiled program.
+    """A distribution of noise, and the mean force of a contact under it; static, since it shapes the compiled program."""
 
-    Attributes:
-        reach: distance beyond which `share` is below 1e-8, and `depth` is held.
-        ramp: mean force at a distance.
-        share: probability of contact at a distance, minus the slope of `ramp`.
-        density: density of the noise, minus the slope of `share`.
-    """
-
-    reach: float
-    ramp: Callable[[_Shape], _Shape]
-    share: Callable[[_Shape], _Shape]
-    density: Callable[[_Shape], _Shape]
+    reach: float  # distance beyond which `share` is below 1e-8, and `depth` is held
+    ramp: Callable[[_Shape], _Shape]  # mean force at a distance
+    share: Callable[[_Shape], _Shape]  # probability of contact at a distance, minus the slope of `ramp`
+    density: Callable[[_Shape], _Shape]  # density of the noise, minus the slope of `share`
 
     def depth(self, distance: _Shape) -> _Shape:
         """Return the mean penetration given contact; constant beyond `reach`, where contact is improbable."""
@@ -82,11 +73,9 @@ def _tail_coefficients(degree: int) -> tuple[float, ...]:
 
 @jax.custom_jvp
 def _normal_share(r: _Shape) -> _Shape:
-    """Return Φ(-r) to relative rounding for either sign of r.
-
-    Not by `jax.lax.erfc`, which ends in polynomials: XLA considers them cheap and evaluates them again for every entry of
-    the Hessian. An exponential is computed once and stored.
-    """
+    """Return Φ(-r) to relative rounding for either sign of r."""
+    # Not by `jax.lax.erfc`, which ends in polynomials: XLA considers them cheap and evaluates them again for every
+    # entry of the Hessian. An exponential is computed once and stored.
     size = jnp.abs(r)
     t = 1 / (1 + size / _TAIL_SCALE)
     s = 2 * t - 1
@@ -115,35 +104,24 @@ def _normal_density(w: _Shape) -> _Shape:
     return jnp.exp(-0.5 * w**2) * (1 / math.sqrt(2 * math.pi))
 
 
-def _logistic_ramp(r: _Shape) -> _Shape:
-    return _BETA * jax.nn.softplus(-r / _BETA)
-
-
-def _logistic_share(r: _Shape) -> _Shape:
-    return jax.nn.sigmoid(-r / _BETA)
-
-
-def _logistic_density(w: _Shape) -> _Shape:
-    return _logistic_share(w) * _logistic_share(-w) / _BETA
-
-
 def _barrier_ramp(r: _Shape) -> _Shape:
     # Two forms of the same number: each cancels on the other side.
     root = jnp.sqrt(r**2 + _SQUARE)
     return jnp.where(r > 0, 0.5 * _SQUARE / (root + jnp.abs(r)), 0.5 * (root - r))
 
 
-def _barrier_share(r: _Shape) -> _Shape:
-    return _barrier_ramp(r) / jnp.sqrt(r**2 + _SQUARE)
-
-
-def _barrier_density(w: _Shape) -> _Shape:
-    root = jnp.sqrt(w**2 + _SQUARE)
-    return 0.5 * _SQUARE / root / root / root
-
-
 KERNELS: dict[str, Kernel] = {
     "gaussian": Kernel(6.0, _normal_ramp, _normal_share, _normal_density),
-    "logistic": Kernel(11.0, _logistic_ramp, _logistic_share, _logistic_density),
-    "log_barrier": Kernel(1e4, _barrier_ramp, _barrier_share, _barrier_density),
+    "logistic": Kernel(
+        reach=11.0,
+        ramp=lambda r: _BETA * jax.nn.softplus(-r / _BETA),
+        share=lambda r: jax.nn.sigmoid(-r / _BETA),
+        density=lambda w: jax.nn.sigmoid(-w / _BETA) * jax.nn.sigmoid(w / _BETA) / _BETA,
+    ),
+    "log_barrier": Kernel(
+        reach=1e4,
+        ramp=_barrier_ramp,
+        share=lambda r: _barrier_ramp(r) / jnp.sqrt(r**2 + _SQUARE),
+        density=lambda w: 0.5 * _SQUARE * (w**2 + _SQUARE) ** -1.5,
+    ),
 }

@@ -23,9 +23,10 @@ from mjxgrad.batched.maps import safe_norm
 from mjxgrad.bodies import spatial, tree
 from mjxgrad.contact.collision import slot_geoms
 from mjxgrad.contact.law import Impedance, impedance, is_square, stiffness_damping
-from mjxgrad.solver.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, Side, fold
+from mjxgrad.solver.jacobian import AxisRows, ContactRows, DenseRows, JoinedRows, RowMap, fold
 
 _PerRow = Float[Array, " rows"]
+_Points, _Frames = Float[Array, "contacts 3"], Float[Array, "contacts 3 3"]
 
 
 class Block(eqx.Module):
@@ -78,11 +79,9 @@ def weight_of(block: Block, impedance: _PerRow) -> _PerRow:
 
 
 def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
-    """Return the rows of all contacts of one dimension.
-
-    A pyramid has two opposite edges J_n ± μ_k J_k for each direction of friction. Other contacts have a normal row, then rows of
-    friction.
-    """
+    """Return the rows of all contacts of one dimension."""
+    # A pyramid has two opposite edges J_n ± μ_k J_k for each direction of friction. Other contacts have a normal row,
+    # then rows of friction.
     contact = data._impl.contact
     chosen = np.nonzero(np.asarray(contact.dim) == dim)[0]
     if not chosen.size:
@@ -123,7 +122,6 @@ def contacts(model: mjx.Model, data: mjx.Data, dim: int) -> Block | None:
 def _cone_rows(
     model: mjx.Model, contact: Any, inverse_weight: Float[Array, " contacts"], dim: int
 ) -> tuple[_PerRow, Float[Array, "rows 2"]]:
-    """Return Â and solref of the rows of elliptic or frictionless contacts, the normal row first."""
     weights, solref = [inverse_weight[:, None]], [contact.solref[:, None]]
     if dim > 1:
         friction2 = contact.friction[:, : dim - 1] ** 2
@@ -136,10 +134,8 @@ def _cone_rows(
 
 
 def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int) -> RowMap:
-    """Return the map of consecutive contacts of one dimension, from slot `first` on.
-
-    A row of a contact between known bodies is their relative velocity at a point.
-    """
+    """Return the map of consecutive contacts of one dimension, from slot `first` on."""
+    # A row of a contact between known bodies is their relative velocity at a point.
     friction = contact.friction[:, : dim - 1] if has_pyramids(model, dim) else None
     bodies = _bodies(model, data, contact, first)
     if not isinstance(bodies, np.ndarray):
@@ -153,7 +149,7 @@ def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int
     num_sides = max(1, int(own.any(axis=2).sum(axis=1).max()))
     order = order[:, :num_sides]
     sides = tuple(
-        tuple(Side(2.0 * k - 1, tuple(int(dof) for dof in np.nonzero(own[slot, k])[0])) for k in of_slot)
+        tuple((2.0 * k - 1, tuple(np.flatnonzero(own[slot, k]).tolist())) for k in of_slot)
         for slot, of_slot in enumerate(order)
     )
     roots = model.body_rootid[np.take_along_axis(bodies, order, axis=1)]
@@ -167,7 +163,6 @@ def has_pyramids(model: mjx.Model, dim: int) -> bool:
 
 
 def _bodies(model: mjx.Model, data: mjx.Data, contact: Any, first: int) -> np.ndarray | Array:
-    """Return the bodies of consecutive contacts, as constants if they are known."""
     slots = slot_geoms(model, data)
     if slots is None:
         return jnp.asarray(model.geom_bodyid)[contact.geom]
@@ -180,17 +175,10 @@ def least_friction(friction: Float[Array, "contacts 5"]) -> Float[Array, "contac
 
 
 def contact_jacobian(
-    model: mjx.Model,
-    data: mjx.Data,
-    position: Float[Array, "contacts 3"],
-    frame: Float[Array, "contacts 3 3"],
-    bodies: Array | np.ndarray,
-    dim: int,
+    model: mjx.Model, data: mjx.Data, position: _Points, frame: _Frames, bodies: Array | np.ndarray, dim: int
 ) -> Float[Array, "contacts dim nv"]:
-    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames, as in `ContactRows`.
-
-    The second body counts positive, the first negative.
-    """
+    """Return the Jacobian of the relative velocity of two bodies at points, in the points' frames, as in `ContactRows`."""
+    # The second body counts positive, the first negative.
     moves = jnp.asarray(tree.moving_dofs(model), position.dtype)[bodies]  # contacts, 2, nv
     lever = position[:, None] - maps.choose(jnp.asarray(model.body_rootid)[bodies], data.subtree_com)
     signs = moves * jnp.array([-1.0, 1.0], position.dtype)[:, None]
@@ -260,7 +248,7 @@ def friction_loss(model: mjx.Model, data: mjx.Data) -> Block | None:
     count, dtype = dofs.size + tendons.size, data.qvel.dtype
     parts: list[RowMap] = []
     if dofs.size:
-        parts.append(_axis_rows(jnp.ones(dofs.size, dtype), dofs, model))
+        parts.append(AxisRows(jnp.ones(dofs.size, dtype), tuple(dofs.tolist()), model.nv))
     if tendons.size:
         parts.append(DenseRows(data._impl.ten_J[tendons][:, None]))
     zero = jnp.zeros(count, dtype)
@@ -299,7 +287,8 @@ def limits(model: mjx.Model, data: mjx.Data) -> list[Block | None]:
         dofs = model.jnt_dofadr[joints]
         position = linear.take(data.qpos, tuple(model.jnt_qposadr[joints].tolist()))
         distance, sign = _nearer_end(position, model.jnt_range[joints])
-        blocks[1] = one_sided(_axis_rows(sign, dofs, model), distance, model.dof_invweight0[dofs], joints, *of_joints)
+        rows = AxisRows(sign, tuple(dofs.tolist()), model.nv)
+        blocks[1] = one_sided(rows, distance, model.dof_invweight0[dofs], joints, *of_joints)
     if tendons.size:
         distance, sign = _nearer_end(data.ten_length[tendons], model.tendon_range[tendons])
         rows = DenseRows((sign[:, None] * data._impl.ten_J[tendons])[:, None])
@@ -338,10 +327,6 @@ def _ball_limit(model: mjx.Model, data: mjx.Data, joints: np.ndarray) -> tuple[R
     select[np.arange(len(joints))[:, None], np.arange(3), model.jnt_dofadr[joints][:, None] + np.arange(3)] = 1
     rows = DenseRows(-jnp.sum(axis[:, :, None] * jnp.asarray(select, axis.dtype), axis=1, keepdims=True))
     return rows, jnp.max(model.jnt_range[joints], axis=1) - angle
-
-
-def _axis_rows(sign: _PerRow, dofs: np.ndarray, model: mjx.Model) -> AxisRows:
-    return AxisRows(sign, tuple(int(dof) for dof in dofs), model.nv)
 
 
 def _nearer_end(position: _PerRow, interval: Float[Array, "rows 2"]) -> tuple[_PerRow, _PerRow]:

@@ -28,8 +28,9 @@ def _problem(groups):
     def any_sign(*shape):
         return jnp.asarray(random.normal(size=(*shape, _BATCH)))
 
-    pieces = tuple(any_sign(g.num, g.dim, 1 if g.is_diagonal else len(g.dofs)) for g in groups)
-    friction = tuple(positive(g.num, g.dim - 1) if g.is_pyramid else None for g in groups)
+    entries = (any_sign(g.num, g.dim, 1 if g.is_diagonal else len(g.dofs)) for g in groups)
+    friction = (positive(g.num, g.dim - 1) if g.is_pyramid else None for g in groups)
+    pieces = tuple(zip(entries, friction, strict=True))
     num_rows, cones = sum(g.num_rows for g in groups), sum(g.num for g in groups if g in _CONES)
     layout = RowLayout(0, 0, num_rows, (ConeGroup(num_rows - 3 * cones, cones, 3),) if cones else ())
     roots = any_sign(cones, 3, 3)
@@ -37,7 +38,7 @@ def _problem(groups):
         positive(layout.simple_stop), (jnp.einsum("cijb,ckjb->cikb", roots, roots),) if cones else ()
     )
     mass = jnp.eye(_NV)[:, :, None] * positive(_NV)
-    return layout, (mass, SparseRows(pieces, friction, groups, _NV), row_hessian, any_sign(_NV))
+    return layout, (mass, SparseRows(pieces, groups, _NV), row_hessian, any_sign(_NV))
 
 
 @pytest.mark.parametrize("groups", [_SIMPLE + _PYRAMIDS, _SIMPLE + _CONES], ids=["pyramids", "cones"])
