@@ -26,21 +26,13 @@ _FEWEST_ITERATIONS, _ITERATIONS = 20, 100
 
 @dataclass(frozen=True)
 class Conversion:
-    """A setting of the file and its replacement.
+    """A setting of the file and its replacement."""
 
-    Attributes:
-        what: the setting, as MJCF calls it.
-        given: its value in the file.
-        used: its replacement.
-        reason: why the motion is the same, or how it differs.
-        exact: whether the motion equals C MuJoCo's, up to the solver's tolerance.
-    """
-
-    what: str
-    given: str
-    used: str
-    reason: str
-    exact: bool = True
+    what: str  # the setting, as MJCF calls it
+    given: str  # its value in the file
+    used: str  # its replacement
+    reason: str  # why the motion is the same, or how it differs
+    exact: bool = True  # whether the motion equals C MuJoCo's, up to the solver's tolerance
 
 
 def waking(model: mujoco.MjModel) -> Iterator[Conversion]:
@@ -194,24 +186,17 @@ _STAGES = (
 
 @dataclass(frozen=True)
 class Omission:
-    """Work that a step of this scene leaves out.
+    """Work that a step of this scene leaves out."""
 
-    Attributes:
-        what: the stage.
-        reason: why the motion does not need it.
-    """
-
-    what: str
-    reason: str
+    what: str  # the stage
+    reason: str  # why the motion does not need it
 
 
 def switch_off(model: mujoco.MjModel) -> tuple[Omission, ...]:
-    """Switch off the parts that a scene does not need, and return all omissions of its step.
-
-    Most stages cost nothing once the model has no element for them, since their arrays have no rows. XLA removes what is
-    computed for reading only from a compiled rollout. One flag is set in place: Euler integration would factorise the mass
-    matrix a second time for zero damping.
-    """
+    """Switch off the parts that a scene does not need, and return all omissions of its step."""
+    # Most stages cost nothing once the model has no element for them, since their arrays have no rows. XLA removes what is
+    # computed for reading only from a compiled rollout. One flag is set in place: Euler integration would factorise the mass
+    # matrix a second time for zero damping.
     omissions = []
     for what, absence, is_there, flag in _STAGES:
         if flag is not None and model.opt.disableflags & flag.value:

@@ -21,15 +21,7 @@ from mjxgrad.batched.device import own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
-from mjxgrad.scene.conversions import (
-    AFTER_REFUSALS,
-    BEFORE_REFUSALS,
-    Conversion,
-    drop_sensors,
-    kinematics_alone,
-    switch_off,
-    waking,
-)
+from mjxgrad.scene import conversions as rules
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
 from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
 from mjxgrad.stepping import EngineName
@@ -93,7 +85,7 @@ def load_scene(
     mj_model, stepped, conversions, unsupported = _converted(mj_model, name, engine)
     omissions = ()
     if not keep_everything and not unsupported:
-        omissions = switch_off(stepped)
+        omissions = rules.switch_off(stepped)
         conversions += _fit_solver(stepped)
     pairs = contact_pairs(stepped) if not unsupported or count_pairs(mj_model) > MOST_PAIRS else contact_pairs(mj_model)
     with jax.ensure_compile_time_eval():  # also within a traced function that loads its own scene
@@ -183,7 +175,7 @@ def _check_model(model: mujoco.MjModel, name: str) -> None:
 
 def _converted(
     model: mujoco.MjModel, name: str, engine: EngineName | None
-) -> tuple[mujoco.MjModel, mujoco.MjModel, list[Conversion], str]:
+) -> tuple[mujoco.MjModel, mujoco.MjModel, list[rules.Conversion], str]:
     """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
     original = copy.deepcopy(model)
     try:
@@ -201,35 +193,35 @@ def _converted(
                 f"MJX has the maths of MuJoCo {MJX_VERSION}, and this is MuJoCo {mujoco.__version__}; "
                 "pip install 'mjxgrad[mjx]' for MJX's step"
             )
-        conversions = [c for rule in BEFORE_REFUSALS for c in rule(model)]
+        conversions = [c for rule in rules.BEFORE_REFUSALS for c in rule(model)]
         refused = refusal_messages(model, REFUSALS if engine == "mjx" else (*REFUSALS, UNLIKE))
         if len(refused) == 1:
             raise SceneError(f"{name} cannot be stepped by MJX: {refused[0]}")
         if refused:
             listed = "\n".join(f"  - {message}" for message in refused)
             raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
-        conversions += [c for rule in AFTER_REFUSALS for c in rule(model)]
+        conversions += [c for rule in rules.AFTER_REFUSALS for c in rule(model)]
         stepped = copy.deepcopy(model)
-        conversions += list(drop_sensors(stepped))
+        conversions += list(rules.drop_sensors(stepped))
     except SceneError as error:
         if engine == "mjx":
             raise
-        conversions = list(waking(original))
-        return original, kinematics_alone(original), conversions, str(error)
+        conversions = list(rules.waking(original))
+        return original, rules.kinematics_alone(original), conversions, str(error)
     return model, stepped, conversions, ""
 
 
-def _fit_solver(model: mujoco.MjModel) -> list[Conversion]:
+def _fit_solver(model: mujoco.MjModel) -> list[rules.Conversion]:
     """Store small matrices densely, and limit the tolerance to the resolution of float32."""
     conversions = []
     if model.nv < _SPARSE_FROM:
         if model.opt.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE:
             reason = f"faster below {_SPARSE_FROM} degrees of freedom, the same numbers"
-            conversions.append(Conversion("jacobian", "sparse", "dense", reason))
+            conversions.append(rules.Conversion("jacobian", "sparse", "dense", reason))
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     if jnp.result_type(float) == jnp.float32 and model.opt.tolerance < _FLOAT32_TOLERANCE:
         given, model.opt.tolerance = f"{model.opt.tolerance:g}", _FLOAT32_TOLERANCE
-        conversions.append(Conversion("tolerance", given, f"{_FLOAT32_TOLERANCE:g}", "float32 resolves no more"))
+        conversions.append(rules.Conversion("tolerance", given, f"{_FLOAT32_TOLERANCE:g}", "float32 resolves no more"))
     return conversions
 
 
@@ -269,10 +261,8 @@ def _put(model: mujoco.MjModel, name: str, max_contacts: int | None) -> tuple[mj
 
 
 def _make_data(model: mujoco.MjModel, mjx_model: mjx.Model, max_contacts: int | None) -> mjx.Data:
-    """Return MJX's data with contact slots, including frictionless ones beside elliptic ones, which MJX refuses.
-
-    A pair of boxes has more of them than in MJX.
-    """
+    """Return MJX's data with contact slots, including frictionless ones beside elliptic ones, which MJX refuses."""
+    # A pair of boxes has more of them than in MJX.
     cone, model.opt.cone = model.opt.cone, mujoco.mjtCone.mjCONE_PYRAMIDAL
     data = mjx.make_data(model, impl="jax", device=own_device())
     model.opt.cone = cone

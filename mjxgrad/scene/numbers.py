@@ -14,8 +14,21 @@ def with_numbers(mj_model: mujoco.MjModel, numbers: Mapping[str, Any]) -> mujoco
     """Return a copy of a C model with the numbers of an MJX model, where it has them."""
     target = copy.deepcopy(mj_model)
     for name, value in numbers.items():
-        is_option = name.startswith("opt.")
-        _copy_into(target.opt if is_option else target, name.removeprefix("opt."), np.asarray(value))
+        holder, name, value = (
+            target.opt if name.startswith("opt.") else target,
+            name.removeprefix("opt."),
+            np.asarray(value),
+        )
+        given = np.asarray(getattr(holder, name, None))
+        if not np.issubdtype(given.dtype, np.floating):
+            continue
+        if given.size != value.size:
+            remedy = "take one element of the batch"
+            raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; {remedy}")
+        # Numbers that differ only by float32 rounding keep the digits of the file.
+        value = value.reshape(given.shape)
+        used = np.where(value == given.astype(value.dtype), given, value)
+        setattr(holder, name, used if used.ndim else float(used))
     if any(not np.array_equal(getattr(target, name), getattr(mj_model, name)) for name in _PLACES):
         _enclose(target)
     if not np.array_equal(target.geom_margin, mj_model.geom_margin):
@@ -39,15 +52,3 @@ def _enclose(target: mujoco.MjModel) -> None:
                 centre = turn.reshape(3, 3).T @ (target.geom_pos[geom] - target.body_ipos[body])
                 target.bvh_aabb[node] = np.concatenate([centre, np.full(3, radius)])
                 target.geom_aabb[geom] = np.repeat([0.0, radius], 3)
-
-
-def _copy_into(target: mujoco.MjModel | mujoco.MjOption, name: str, value: np.ndarray) -> None:
-    given = np.asarray(getattr(target, name, None))
-    if not np.issubdtype(given.dtype, np.floating):
-        return
-    if given.size != value.size:
-        raise ValueError(f"to_mujoco needs one scene, got {name} of shape {value.shape}; take one element of the batch")
-    value = value.reshape(given.shape)
-    # Numbers that differ only by float32 rounding keep the digits of the file.
-    used = np.where(value == given.astype(value.dtype), given, value)
-    setattr(target, name, used if used.ndim else float(used))

@@ -77,7 +77,7 @@ class Scene(eqx.Module):
         return self.chosen or ("mujoco" if self.unsupported else "mjx")
 
     def with_engine(self, engine: EngineName) -> "Scene":
-        """Return the scene stepped by MJX, by C MuJoCo: on all cores, without compilation, differentiable once; or by MuJoCo Warp.
+        """Return the scene stepped by MJX, by MuJoCo Warp, or by C MuJoCo: on all cores, uncompiled, differentiable once.
 
         Raises:
             ValueError: if there is no such engine.
@@ -282,7 +282,6 @@ def _heading(scene: Scene) -> str:
 
 
 def _contacts(scene: Scene) -> str:
-    """Return one line per group of pairs with equal parameters."""
     if not scene.pairs:
         return ""
     columns = list(_columns(scene))
@@ -333,7 +332,6 @@ def _left_out(scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 def _columns(scene: Scene) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield name, unit and cells of each column."""
     parameters = scene.contact_parameters()
     yield "condim", "", [str(pair.condim) for pair in scene.pairs]
     yield "solref", "", [" ".join(format_number(x) for x in row) for row in np.asarray(parameters.solref).tolist()]
