@@ -67,9 +67,8 @@ class Policy(eqx.Module):
     def save(self, path: str | Path) -> None:
         """Write the `arrays` as an archive of NumPy's, an .npz, from which ten lines of NumPy run the policy; see the how-to."""
         if self.normaliser.count.ndim:
-            raise ValueError(
-                "policy must be one, got several side by side: jax.tree.map(lambda x: x[0], policy) is the first"
-            )
+            first = "jax.tree.map(lambda x: x[0], policy) is the first"
+            raise ValueError(f"policy must be one, got several side by side: {first}")
         content = io.BytesIO()
         np.savez(content, allow_pickle=False, **{name: np.asarray(x) for name, x in self.arrays.items()})
         write(path, content.getvalue())
@@ -179,22 +178,16 @@ class ActorCritic(Method):
         first, last = settings.stddev
         stddev = first + (last - first) * learner.num_updates / self.num_updates
         window, environments, gradients = self._windows(learner, noise_key, stddev)
-        policy, actor_moments, products, found = self._improve(learner, window, gradients)
-        critic, target, critic_moments = learner.critic, learner.target, learner.critic_moments
-        critic_loss = jnp.zeros(())
+        improved, found = self._improve(learner, window, gradients)
+        fitted, critic_loss = improved, jnp.zeros(())
         if settings.has_critic:
-            critic, target, critic_moments, critic_loss = self._fit_critic(learner, window, critic_key)
+            fitted, critic_loss = self._fit_critic(improved, window, critic_key)
         episode_return, ended = _episodes(window, learner.episode_return)
         normaliser = learner.normaliser.with_more(window.seen)
         following = dataclasses.replace(
-            learner,
-            policy=eqx.tree_at(lambda p: p.normaliser, policy, normaliser.of_first(environments.obs.shape[-1])),
+            fitted,
+            policy=Policy(fitted.policy.actor, normaliser.of_first(environments.obs.shape[-1])),
             normaliser=normaliser,
-            critic=critic,
-            target=target,
-            actor_moments=actor_moments,
-            critic_moments=critic_moments,
-            products=products,
             environments=environments,
             episode_return=episode_return,
             num_updates=learner.num_updates + 1,
@@ -236,10 +229,8 @@ class ActorCritic(Method):
         shared = (arrays, learner.policy.actor, learner.target, learner.normaliser, stddev)
         return over_devices(one, num_shared=1)(shared, learner.environments, learner.model_keys, noise)
 
-    def _improve(
-        self, learner: Learner, window: Window, gradients: Gradients
-    ) -> tuple[Policy, optax.OptState, Products, Metrics]:
-        """Return the policy moved along the mixture, if that is finite, its optimiser's state, products and metrics."""
+    def _improve(self, learner: Learner, window: Window, gradients: Gradients) -> tuple[Learner, Metrics]:
+        """Move the policy along the mixture, if that is finite."""
         policy = learner.policy
         shortened, is_shortened = gradients.shortened(self.settings.largest_sample)
 
@@ -279,20 +270,14 @@ class ActorCritic(Method):
             "shortened": is_shortened.mean(),
             "skipped": (~is_finite).astype(norm.dtype),
         }
-        return Policy(actor, policy.normaliser), moments, products, found
+        moved = {"policy": Policy(actor, policy.normaliser), "actor_moments": moments, "products": products}
+        return dataclasses.replace(learner, **moved), found
 
-    def _fit_critic(
-        self, learner: Learner, window: Window, key: PRNGKeyArray
-    ) -> tuple[ValueFunction, ValueFunction, optax.OptState, Float[Array, ""]]:
-        """Return value function and target fitted to the window's returns, the optimiser's state and the last pass's loss."""
+    def _fit_critic(self, learner: Learner, window: Window, key: PRNGKeyArray) -> tuple[Learner, Float[Array, ""]]:
+        """Fit value function and target to the window's returns; return the loss of the last pass, too."""
         normaliser = learner.normaliser
-
-        def targets(window: Window) -> Float[Array, " steps"]:
-            return lambda_returns(
-                window, lambda seen: learner.target(normaliser(seen)), self.settings.discount, _CRITIC_TRACE
-            )
-
-        wanted = jax.vmap(targets)(window).reshape(-1)
+        value, how = lambda seen: learner.target(normaliser(seen)), (self.settings.discount, _CRITIC_TRACE)
+        wanted = jax.vmap(lambda one: lambda_returns(one, value, *how))(window).reshape(-1)
         critic, target = learner.critic.with_more(wanted), learner.target.with_more(wanted)
         seen = normaliser(window.seen.reshape(len(wanted), -1))
         _, optimiser = optimisers(self.settings, self.num_updates)
@@ -311,7 +296,8 @@ class ActorCritic(Method):
         (network, moments), losses = jax.lax.scan(fit, (critic.network, learner.critic_moments), rows)
         critic = ValueFunction(network, critic.moments)
         target = jax.tree.map(lambda old, new: old + _TARGET_RATE * (new - old), target, critic)
-        return critic, target, moments, losses[-self.settings.critic_batches :].mean()
+        fitted = dataclasses.replace(learner, critic=critic, target=target, critic_moments=moments)
+        return fitted, losses[-self.settings.critic_batches :].mean()
 
 
 def optimisers(

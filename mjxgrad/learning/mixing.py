@@ -35,27 +35,16 @@ Halves = tuple[PyTree, PyTree]
 
 
 class Products(eqx.Module):
-    r"""Running means of the products of both gradients by the parameters, each update's over its squared norms.
+    """Running means of the products of both gradients by the parameters, each update's over its squared norms."""
 
-    Attributes:
-        first: $|\bar d|^2$.
-        first_noise: $V^1$, the trace of the covariance of first order.
-        zeroth: $|g|^2$.
-        zeroth_noise: $V^0$, that of zeroth order.
-        across: $\bar d \cdot g$.
-        zeroth_spread: variance of an update's `zeroth`, half the squared change from the update before.
-        across_spread: variance of an update's `across`.
-        last: the last update's `zeroth` and `across`.
-    """
-
-    first: Float[Array, ""]
-    first_noise: Float[Array, ""]
-    zeroth: Float[Array, ""]
-    zeroth_noise: Float[Array, ""]
-    across: Float[Array, ""]
-    zeroth_spread: Float[Array, ""]
-    across_spread: Float[Array, ""]
-    last: Float[Array, "2"]
+    first: Float[Array, ""]  # |d̄|²
+    first_noise: Float[Array, ""]  # V¹, the trace of the covariance of first order
+    zeroth: Float[Array, ""]  # |g|²
+    zeroth_noise: Float[Array, ""]  # V⁰, that of zeroth order
+    across: Float[Array, ""]  # d̄ · g
+    zeroth_spread: Float[Array, ""]  # variance of an update's `zeroth`, half the squared change from the update before
+    across_spread: Float[Array, ""]  # variance of an update's `across`
+    last: Float[Array, "2"]  # the last update's `zeroth` and `across`
 
     @classmethod
     def none(cls) -> "Products":

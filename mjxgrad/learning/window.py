@@ -34,30 +34,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from mjxgrad.envs import Environment, EnvState
-from mjxgrad.learning.bundle import Bundle
 from mjxgrad.learning.networks import Network, Normaliser
+from mjxgrad.learning.settings import Bundle
 
 Value = Callable[[Float[Array, " seen"]], Float[Array, ""]]
 
 
 class Window(eqx.Module):
-    """The steps of one environment, or a single step without the axis; under `jax.vmap` fields gain leading axes.
+    """The steps of one environment, or a single step without the axis; under `jax.vmap` fields gain leading axes."""
 
-    Attributes:
-        seen: observation in which an action was chosen, and what is privileged behind it.
-        next_seen: the same after the action, before any reset.
-        rewards: reward of the action.
-        terminated: whether the episode ended for good.
-        truncated: whether its time was up.
-        metrics: the terms of the rewards, and `diverged`.
-    """
-
-    seen: Float[Array, "*steps seen"]
-    next_seen: Float[Array, "*steps seen"]
+    seen: Float[Array, "*steps seen"]  # observation in which an action was chosen, and what is privileged behind it
+    next_seen: Float[Array, "*steps seen"]  # the same after the action, before any reset
     rewards: Float[Array, "*steps"]
-    terminated: Bool[Array, "*steps"]
-    truncated: Bool[Array, "*steps"]
-    metrics: dict[str, Float[Array, "*steps"]]
+    terminated: Bool[Array, "*steps"]  # whether the episode ended for good
+    truncated: Bool[Array, "*steps"]  # whether its time was up
+    metrics: dict[str, Float[Array, "*steps"]]  # the terms of the rewards, and `diverged`
 
     def next_values(self, value: Value) -> Float[Array, " steps"]:
         """Return the values after each step; zero after an episode that ended for good."""
@@ -69,17 +60,11 @@ class Window(eqx.Module):
 
 
 class Gradients(eqx.Module):
-    """Both gradients of a window's return by step and action before squashing; under `jax.vmap` fields gain leading axes.
-
-    Attributes:
-        first: first-order gradient.
-        zeroth: zeroth-order gradient.
-        is_finite: whether the first-order gradient of all actions of a step is finite.
-    """
+    """Both gradients of a window's return by step and action before squashing; under `jax.vmap` fields gain leading axes."""
 
     first: Float[Array, "*environments steps nu"]
     zeroth: Float[Array, "*environments steps nu"]
-    is_finite: Bool[Array, "*environments steps"]
+    is_finite: Bool[Array, "*environments steps"]  # whether the first-order gradient of all actions of a step is
 
     @property
     def sound(self) -> "Gradients":
