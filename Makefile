@@ -17,7 +17,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 export JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES ?= -1
 
-.PHONY: help setup demo test test-slow mujoco4 bench throughput engines costs rates gradient_audit identify-bench robots gallery docs lint clean $(EXPERIMENTS)
+.PHONY: help setup demo test test-slow test-warp mujoco4 bench throughput engines costs rates gradient_audit identify-bench robots gallery docs lint clean $(EXPERIMENTS)
 
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(firstword $(MAKEFILE_LIST))
@@ -61,6 +61,10 @@ mujoco4: .venv/.installed  ## run C's engine, check and sweep beside a later MuJ
 	@.cache/mujoco4/bin/python -m pip install --quiet --disable-pip-version-check --constraint .cache/others.txt \
 	    --editable '.[test]' 'mujoco$(MUJOCO)'
 	@.cache/mujoco4/bin/python -m pytest -n 2 --dist worksteal tests/engines tests/checking $(PYTEST_ARGS)
+
+test-warp: .venv/.installed  ## install NVIDIA Warp beside .venv and test the engine by it, on a processor
+	@test -d .cache/warp/warp || $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target .cache/warp 'warp-lang==1.18.*'
+	@PYTHONPATH=.cache/warp $(BIN)/python -m pytest tests/engines/test_warp.py $(PYTEST_ARGS)
 
 bench: .venv/.installed  ## measure speed and memory against mjx.step
 	@$(BIN)/python -m experiments bench $(ARGS)

@@ -23,7 +23,7 @@ _Vector = Float[Array, " width"]
 _Blocks = list[list[Any]]  # 16 by 16, None below the diagonal
 
 # Matrices are eliminated in blocks of so many columns: a program selects a row by a sum over the whole block.
-_BLOCK, _MOST_COLUMNS = 16, 32
+_BLOCK, _MOST_COLUMNS = 16, 64
 # Number of warps by the largest number of entries of J. Several warps exchange sums through shared memory.
 _WARPS = {2048: 1, 4096: 2, 8192: 8}
 _MOST_ROWS = 1024

@@ -7,6 +7,8 @@ mode keeps states alone and makes the columns again, as many at a time as memory
 
 import dataclasses
 import functools
+import logging
+import sys
 import weakref
 from typing import Any, ClassVar
 
@@ -21,7 +23,6 @@ from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies import spatial, tree
-from mjxgrad.bodies.kinematics import integrate_position
 from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows
 from mjxgrad.engines.mjx import MJX, Moving, Scan, roll_out
 from mjxgrad.engines.mujoco import observed
@@ -32,9 +33,11 @@ from mjxgrad.stepping import Contact, Discrete
 
 _POSITION, _OTHER = 3e-5, 1e-3  # widths of differences (m or rad; m/s, rad/s or the unit of an input)
 _AT_ONCE = 2**32  # bytes of the worlds that are stepped in one call
-_ROOM = 64  # contacts of a world, where none is given
+_ROOM = 48  # contacts of a world, unless `max_contacts` says
+_TILE = 64  # Warp reads rows in blocks of so many, beyond the end if they do not fit
 _MOTION = ("qpos", "qvel", "act")
 _GIVEN = (*_MOTION, "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "qacc_warmstart", "time")
+_NUMBER = "model."  # before the names of the model's numbers that are not those of its file
 _INEXACT = (
     1 << 9 | 1 << 10
 )  # bits of Warp's overflow: iterations of the solver and of its line search; others are of room
@@ -51,26 +54,23 @@ class Warp(MJX):
         return state
 
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
-        _check(motion.scene)
         return roll_out(motion, state, rows, _Scan)
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
         rows = Rows(jnp.broadcast_to(ctrl, (num_steps, len(ctrl))), jnp.zeros((num_steps, len(ctrl))), {})
-        return self.roll_out(Motion(scene, None, None, None, "state", True, contact, False), state, rows).final
+        return self.roll_out(Motion(scene, None, None, None, "state", True, contact), state, rows).final
 
     def look(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
     ) -> PyTree:
-        _check(scene)
         readings = _step(scene, state, ctrl, inputs)["sensordata"]
         return observed(scene, state, ctrl, inputs, readings, observe)
 
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
     ) -> tuple[Array, Array, Array, Array]:
-        _check(scene)
-        worlds, given = worlds_of(scene.mj_model), _given(scene, state, ctrl, {})
-        matrix = worlds.derivative(given, (*_MOTION, "ctrl"))
+        worlds, given = worlds_of(scene.mj_model, scene.max_contacts), _given(scene, state, ctrl, {})
+        matrix = worlds.derivative(given, tuple(name for name in (*_MOTION, "ctrl") if given[name].size))
         size = 2 * scene.model.nv + scene.model.na
         A, C = jnp.split(matrix[:, :size], [size])
         B, D = jnp.split(matrix[:, size:], [size])
@@ -99,11 +99,19 @@ class _Scan(Scan):
 class Worlds:
     """Steps of many worlds of one C model, and their differences."""
 
-    def __init__(self, mj_model: mujoco.MjModel):
+    def __init__(self, mj_model: mujoco.MjModel, room: int | None):
         self._mj_model, self._runs = weakref.ref(mj_model), tree.joint_runs(mj_model)
-        self.room = _ROOM
+        self._room = room or _ROOM
+        dims = np.concatenate([mj_model.geom_condim, mj_model.pair_dim, [1]])
+        self._rows = mj_model.nv + 6 * mj_model.neq + mj_model.njnt + 2 * mj_model.ntendon
+        self._rows += self._room * max(1, 2 * (int(dims.max()) - 1))
+        self._rows = -(-self._rows // _TILE) * _TILE
+        warp = sys.modules.get("warp")
+        if warp:
+            warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # a library must not print
         try:
-            self._model = mjx.put_model(mj_model, impl="warp")
+            with jax.ensure_compile_time_eval():  # also within a traced function
+                self._model = mjx.put_model(mj_model, impl="warp", graph_mode=warp and warp.JaxCallableGraphMode.NONE)
             self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(mj_model, 1)) if eqx.is_array(x))
         except (NotImplementedError, RuntimeError) as error:
             remedy = "" if "not installed" not in str(error) else ": pip install 'mjxgrad[warp]'"
@@ -121,7 +129,8 @@ class Worlds:
         return model
 
     def _data(self, mj_model: mujoco.MjModel, count: int) -> mjx.Data:
-        return mjx.make_data(mj_model, impl="warp", naconmax=count * self.room, njmax=None)
+        with jax.ensure_compile_time_eval():
+            return mjx.make_data(mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
 
     def _once(self, given: _Values) -> _Values:
         """Return the next states of worlds, which are the leading axis."""
@@ -139,7 +148,13 @@ class Worlds:
             return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
         data = self._data(self.mj_model, count)
         single = {k: x.astype(jnp.float32) for k, x in given.items()}
-        after = jax.vmap(lambda one: mjx.step(self._model, data.replace(**one)))(single)
+
+        def one(given: _Values) -> mjx.Data:
+            numbers = {k.removeprefix(_NUMBER): x for k, x in given.items() if k.startswith(_NUMBER)}
+            state = {k: x for k, x in given.items() if k in _GIVEN}
+            return mjx.step(self._model.tree_replace(numbers) if numbers else self._model, data.replace(**state))
+
+        after = jax.vmap(one)(single)
         dtype = given["qpos"].dtype
         found = {k: getattr(after, k).astype(dtype) for k in (*_MOTION, "time", "qacc_warmstart", "sensordata")}
         return found | {"overflow": after._impl.overflow.reshape(count)}
@@ -147,8 +162,8 @@ class Worlds:
     def _batched(self, size: int, is_batched: list, given: _Values) -> tuple[_Values, dict]:
         (flags,) = is_batched
         whole = {k: x if flags[k] else jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()}
-        found = self._run({k: x.reshape(-1, *x.shape[2:]) for k, x in whole.items()})
-        found = {k: x.reshape(size, -1, *x.shape[1:]) for k, x in found.items()}
+        found = self._run({k: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]) for k, x in whole.items()})
+        found = {k: x.reshape(size, len(x) // size, *x.shape[1:]) for k, x in found.items()}
         return found, dict.fromkeys(found, True)
 
     def _step(self, given: _Values) -> _Values:
@@ -157,7 +172,11 @@ class Worlds:
     def _derived(self, primals: tuple, tangents: tuple) -> tuple[_Values, _Values]:
         (given,), (changes,) = primals, tangents
         found = self.step(given)
-        names = tuple(k for k in _GIVEN[:8] if given[k].size and not isinstance(changes[k], SymbolicZero))
+        names = tuple(k for k, x in given.items() if x.size and not isinstance(changes[k], SymbolicZero))
+        if numbers := [k.removeprefix(_NUMBER) for k in names if k.startswith(_NUMBER)]:
+            told = f"MuJoCo Warp has no derivative by {', '.join(numbers)}"
+            raise NotImplementedError(f"{told}: take scene.with_engine('mujoco'), or jax.lax.stop_gradient of it")
+        names = tuple(k for k in names if k in _GIVEN[:8])
         zeros = {
             k: jnp.zeros_like(x) if eqx.is_inexact_array(x) else np.zeros(x.shape, jax.dtypes.float0)
             for k, x in found.items()
@@ -174,11 +193,11 @@ class Worlds:
 
     def derivative(self, given: _Values, names: tuple[str, ...]) -> Float[Array, "outputs columns"]:
         """Return the derivative of the next state, in tangent space, and of readings by what is given, by central differences."""
-        given = jax.lax.stop_gradient(given)
-        points, widths = [], []
+        dtype, points, widths = given["qpos"].dtype, [], []
+        given = {k: jax.lax.stop_gradient(x).astype(jnp.float32) for k, x in given.items()}  # so that widths are Warp's
         for name in names:
             size = self.mj_model.nv if name == "qpos" else given[name].size
-            away = (_POSITION if name == "qpos" else _OTHER) * jnp.eye(size, dtype=given["qpos"].dtype)
+            away = (_POSITION if name == "qpos" else _OTHER) * jnp.eye(size, dtype=jnp.float32)
             ends = [self._moved(given, name, sign * away) for sign in (1.0, -1.0)]
             widths.append(self._apart(name, ends[0], ends[1]))
             points += [
@@ -192,12 +211,12 @@ class Worlds:
             apart = [jax.vmap(self._to_tangent)(before["qpos"], after["qpos"] - before["qpos"])]
             apart += [after[k] - before[k] for k in ("qvel", "act", "sensordata")]
             columns.append(jnp.concatenate(apart, axis=1) / width[:, None])
-        return jnp.concatenate(columns).T
+        return jnp.concatenate(columns).T.astype(dtype)
 
     def _moved(self, given: _Values, name: str, changes: Float[Array, "columns size"]) -> Array:
         if name != "qpos":
             return given[name] + changes.reshape(-1, *given[name].shape)
-        return jax.vmap(lambda v: integrate_position(self.mj_model, given["qpos"], v, 1.0))(changes)  # pyright: ignore[reportArgumentType]
+        return given["qpos"] + jax.vmap(functools.partial(self._from_tangent, given["qpos"]))(changes)
 
     def _apart(self, name: str, after: Array, before: Array) -> Float[Array, " columns"]:
         """Return how far apart points are that were rounded."""
@@ -217,6 +236,7 @@ class Worlds:
         return jnp.concatenate(parts)
 
     def _from_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+        """Return a small change in tangent space as one of positions."""
         parts = []
         for run in self._runs:
             at = qpos[run.qpos].reshape(-1, run.width)
@@ -229,23 +249,18 @@ class Worlds:
 
 
 @functools.lru_cache(maxsize=16)
-def worlds_of(mj_model: mujoco.MjModel) -> Worlds:
-    """Return the worlds of a C model, which share compiled programs."""
-    return Worlds(mj_model)
+def worlds_of(mj_model: mujoco.MjModel, room: int | None) -> Worlds:
+    """Return the worlds of a C model, with room for so many contacts each."""
+    return Worlds(mj_model, room)
 
 
 def _given(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> _Values:
     found = {name: getattr(scene.data, name) for name in _GIVEN[3:8]} | inputs
     found |= {name: getattr(state, name) for name in _MOTION}
     found |= {"ctrl": ctrl, "qacc_warmstart": state.warmstart, "time": state.time}
-    return {name: jnp.asarray(found[name]) for name in _GIVEN}
+    numbers = {_NUMBER + name: value for name, value in changed_numbers(scene).items()}
+    return {name: jnp.asarray(x) for name, x in ({k: found[k] for k in _GIVEN} | numbers).items()}
 
 
 def _step(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> _Values:
-    return worlds_of(scene.mj_model).step(_given(scene, state, ctrl, inputs))
-
-
-def _check(scene: Scene) -> None:
-    """Refuse numbers that are not those of the C model."""
-    if changed := sorted(changed_numbers(scene)):
-        raise SceneError(f"MuJoCo Warp steps the model as it was loaded, got other numbers of {', '.join(changed)}")
+    return worlds_of(scene.mj_model, scene.max_contacts).step(_given(scene, state, ctrl, inputs))

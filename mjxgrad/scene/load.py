@@ -23,7 +23,7 @@ from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import conversions as rules
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
-from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, numbers_of
+from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, check_installed, numbers_of
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
@@ -76,6 +76,7 @@ def load_scene(
     instance("softness", softness, Softness | None, "mg.Softness, such as mg.Softness(stiffness=1e4)")
     one_of("engine", engine, (*get_args(EngineName), None))
     instance("keep_everything", keep_everything, bool, "True or False")
+    check_installed(engine)
     if max_contacts is not None and whole("max_contacts", max_contacts, None) < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:
@@ -96,7 +97,9 @@ def load_scene(
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
     chosen = engine if engine == "warp" else None
-    scene = Scene(model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported, chosen)  # pyright: ignore[reportArgumentType]
+    scene = Scene(
+        model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported, chosen, max_contacts  # pyright: ignore[reportArgumentType]
+    )  # fmt: skip
     messages = [f"MuJoCo says: {text}" for text in told]
     messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
     head, *more = unsupported.splitlines() or [""]

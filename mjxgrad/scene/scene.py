@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import importlib.util
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
@@ -57,6 +58,7 @@ class Scene(eqx.Module):
         name: source of the scene.
         unsupported: reason why MJX cannot step it, so that C MuJoCo does; empty if MJX can.
         chosen: the engine that `with_engine` chose; None for the default.
+        max_contacts: as given to `load_scene`; MuJoCo Warp has room for so many contacts of a state.
         more: numbers of the C model that MJX lacks and `with_model` changed, by MuJoCo's names, such as "geom_surfacevel".
     """
 
@@ -69,6 +71,7 @@ class Scene(eqx.Module):
     name: str = eqx.field(static=True)
     unsupported: str = eqx.field(static=True, default="")
     chosen: EngineName | None = eqx.field(static=True, default=None)
+    max_contacts: int | None = eqx.field(static=True, default=None)
     more: dict[str, Array] = eqx.field(default_factory=dict)
 
     @property
@@ -81,11 +84,12 @@ class Scene(eqx.Module):
 
         Raises:
             ValueError: if there is no such engine.
-            SceneError: if MJX cannot step the scene.
+            SceneError: if MJX cannot step the scene, or NVIDIA Warp is not installed.
         """
         one_of("engine", engine, get_args(EngineName))
         if engine == "mjx" and self.unsupported:
             raise SceneError(self.unsupported)
+        check_installed(engine)
         return dataclasses.replace(self, chosen=engine)
 
     def contact_parameters(self) -> ContactParameters:
@@ -232,6 +236,12 @@ def numbers_of(model: mjx.Model) -> dict[str, Array]:
     parts = (("", model), ("opt.", model.opt))
     every = {prefix + f.name: getattr(part, f.name, None) for prefix, part in parts for f in part.fields()}
     return {k: v for k, v in every.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)}
+
+
+def check_installed(engine: EngineName | None) -> None:
+    """Refuse MuJoCo Warp where NVIDIA Warp is missing."""
+    if engine == "warp" and importlib.util.find_spec("warp") is None:
+        raise SceneError("engine='warp' needs NVIDIA Warp: pip install 'mjxgrad[warp]'")
 
 
 def changed_numbers(scene: "Scene") -> dict[str, Array]:

@@ -1,0 +1,107 @@
+"""MuJoCo Warp against C MuJoCo: motion, derivatives of steps and of rollouts, batches, room; `make test-warp` installs it."""
+
+import importlib.util
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjxgrad as mg
+from mjxgrad.engines import warp
+from tests.engines.test_derivative import SCENES
+from tests.engines.whole_steps import by_whole_steps
+
+if importlib.util.find_spec("warp") is None:
+    pytest.skip("NVIDIA Warp is not installed", allow_module_level=True)
+
+NAMES = ["free box, pyramids", "ball joint, rolling, elliptic", "muscle, tendon, filter"]
+CART = """<mujoco><option timestep="0.005"/><worldbody><geom name="floor" type="plane" size="2 2 .1"/><body pos="0 0 .1"><joint
+    name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><geom name="ball" size=".1" mass="1"/><body
+    pos="0 0 .2"><joint axis="0 1 0"/><geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/></body></body></worldbody>
+    <actuator><motor joint="x" gear="5"/></actuator><sensor><jointpos joint="x"/></sensor></mujoco>"""
+
+
+def _start(scene):
+    rng, model = np.random.default_rng(1), scene.mj_model
+    qpos = model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, 0.02 * rng.normal(size=model.nv), 1.0)
+    state = mg.initial_state(scene, qpos, 0.3 * rng.normal(size=model.nv), rng.uniform(0.2, 0.8, model.na))
+    return state, rng.uniform(0.05, 0.6, model.nu)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_step_and_its_derivative_are_c_mujocos(name):
+    scene = mg.load_scene(SCENES[name], engine="warp")
+    model, (state, ctrl) = scene.mj_model, _start(scene)
+    controls = np.tile(ctrl, (10, 1))
+    found, right = (
+        mg.rollout(one, state, controls, contact=mg.Discrete()) for one in (scene, scene.with_engine("mujoco"))
+    )
+    np.testing.assert_allclose(found.qpos, right.qpos, atol=1e-5)  # single precision, over ten steps
+    one = mg.linearise(scene, state, ctrl, contact=mg.Discrete())
+    expected = by_whole_steps(model, *(np.asarray(x) for x in (state.qpos, state.qvel, state.act)), ctrl)
+    for ours, theirs in zip((one.A, one.B), expected, strict=True):
+        # Rounding, 6e-8, over a width of 3e-5 is 0.2 % of the largest entry.
+        np.testing.assert_allclose(ours, theirs, atol=0.01 * np.abs(expected[0]).max())
+
+
+def _cost(scene, state, controls):
+    course = mg.rollout(scene, state, controls, contact=mg.Discrete(), observe=lambda model, data: data.sensordata)
+    return course.qpos[-1, 0] + course.observations[-1].sum() + (course.qvel[-1] ** 2).sum()
+
+
+def test_gradients_of_rollouts_agree_in_batches_and_in_parts(monkeypatch):
+    scene = mg.load_scene(CART, engine="warp")
+    controls = 0.5 * np.random.default_rng(0).normal(size=(3, 6, 1))
+    start = mg.initial_state(scene, qvel=np.array([0.1, -0.2, 0.3]))
+
+    def gradients(scene):
+        return jax.jit(jax.vmap(jax.value_and_grad(lambda u: _cost(scene, start, u))))(controls)
+
+    expected = gradients(scene.with_engine("mujoco"))
+    for most in (2**32, 1):  # bytes: one world at a time
+        monkeypatch.setattr(warp, "_AT_ONCE", most)
+        for ours, theirs in zip(gradients(scene), expected, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=5e-3, atol=5e-3 * float(jnp.abs(theirs).max()))
+
+
+def test_forward_mode_is_reverse_mode():
+    scene = mg.load_scene(CART, engine="warp")
+    controls, start = 0.5 * np.random.default_rng(0).normal(size=(6, 1)), mg.initial_state(scene)
+    run = lambda u: _cost(scene, start, u)  # noqa: E731
+    _, along = jax.jvp(run, (controls,), (np.ones_like(controls),))
+    np.testing.assert_allclose(jax.grad(run)(controls).sum(), along, rtol=1e-6)
+
+
+def test_every_motion_of_a_batch_may_have_its_own_numbers():
+    scene = mg.load_scene(CART, engine="warp")
+    masses, controls = np.array([0.5, 1.0, 2.0]), np.ones((8, 1))
+
+    def end(scene, mass):
+        other = scene.with_model(body_mass=scene.model.body_mass.at[1].set(mass))
+        return mg.rollout(other, mg.initial_state(other), controls, contact=mg.Discrete()).qpos[-1]
+
+    found = jax.vmap(lambda mass: end(scene, mass))(masses)
+    expected = [end(scene.with_engine("mujoco"), mass) for mass in masses]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    with pytest.raises(NotImplementedError, match="no derivative by actuator_acc0, .*body_mass.*: take"):
+        jax.grad(lambda mass: end(scene, mass)[0])(1.0)
+
+
+def test_contacts_without_room_are_counted():
+    floor = '<mujoco><worldbody><geom type="plane" size="2 2 .1"/>{}</worldbody></mujoco>'
+    box = '<body pos="{} 0 .099"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+    xml = floor.format("".join(box.format(0.5 * i) for i in range(3)))
+    counts = []
+    for room in (4, 16):
+        scene = mg.load_scene(xml, engine="warp", max_contacts=room)
+        counts.append(int(mg.rollout(scene, mg.initial_state(scene), np.zeros((5, 0))).crowded))
+    assert counts == [5, 0]
+
+
+def test_what_warp_lacks_is_said():
+    scene = mg.load_scene(CART, engine="warp")
+    with pytest.raises(ValueError, match=r"was loaded for MuJoCo Warp: leave out engine='warp'"):
+        mg.rollout(scene, mg.initial_state(scene), np.zeros((2, 1)), contact=mg.Slope())
