@@ -38,10 +38,7 @@ def known(values: Any) -> np.ndarray | None:
 
 
 def is_known(value: Any) -> bool:
-    """Return whether an argument is an array with known values.
-
-    Trees of other leaves (axes of vmap, shapes) go through the same constructors.
-    """
+    """Return whether an argument is an array with known values; axes of vmap and shapes go through the same constructors."""
     return isinstance(value, jax.Array | np.ndarray) and not isinstance(value, jax.core.Tracer)
 
 
@@ -51,7 +48,7 @@ def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> 
     return found is not None and bool(np.all((found if column is None else found[..., column]) == number))
 
 
-def whole(name: str, value: Any, least: int | None = 1, most: int = 2**31 - 1) -> int:
+def whole(name: str, value: Any, least: int | None = 1) -> int:
     """Return a count; refuse fractions, True, counts that are too small or too large, and traced values."""
     if isinstance(value, jax.core.Tracer):
         raise ValueError(f"{name} must be known before anything is compiled, got a traced value; make it static")
@@ -62,8 +59,8 @@ def whole(name: str, value: Any, least: int | None = 1, most: int = 2**31 - 1) -
         raise ValueError(f"{name} must be a whole number, got {value!r}") from None
     if least is not None and number < least:
         raise ValueError(f"{name} must be at least {least}, got {number}")
-    if number > most:
-        raise ValueError(f"{name} must be at most {most}, got {number}")
+    if number >= 2**31:
+        raise ValueError(f"{name} must be at most {2**31 - 1}, got {number}")
     return number
 
 
@@ -73,12 +70,18 @@ def sizes(name: str, value: Any, example: str) -> tuple[int, ...]:
     return tuple(whole(f"{name}[{i}]", one) for i, one in enumerate(value))
 
 
-def within(name: str, value: Any, low: int | float, high: int | float, wanted: str) -> None:
-    """Refuse all but one number between two others; a bound of 0 that is `low` with an infinite `high` is excluded."""
+def positive(name: str, value: Any) -> None:
+    """Refuse all but one finite number above 0."""
     found = np.asarray(real(name, value))
-    is_open = low == 0 and high == np.inf
-    if found.ndim or not (low < found < high if is_open else low <= found <= high):
-        raise ValueError(f"{name} must be {wanted}, got {value}")
+    if found.ndim or not 0 < found < np.inf:
+        raise ValueError(f"{name} must be positive, got {value}")
+
+
+def fraction(name: str, value: Any) -> None:
+    """Refuse all but one number from 0 to 1."""
+    found = np.asarray(real(name, value))
+    if found.ndim or not 0 <= found <= 1:
+        raise ValueError(f"{name} must be from 0 to 1, got {value}")
 
 
 def one_of(name: str, value: Any, choices: Iterable[Any], remedy: str = "") -> None:

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from mjxgrad._arrays import instance, real, whole, within
+from mjxgrad._arrays import instance, positive, real, whole
 from mjxgrad._text import write
 from mjxgrad.batched.device import fits
 from mjxgrad.scene import Scene
@@ -128,7 +128,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
 
     instance("path", path, str | os.PathLike, "the path of a file")
     path, video = Path(path), np.asarray(video)
-    within("fps", fps, 0, np.inf, "positive")
+    positive("fps", fps)
     if path.suffix.lower() != ".mp4" or path.is_dir():
         raise ValueError(f"path must be of a file that ends in .mp4, got {path}")
     if video.ndim != 4 or not len(video) or video.shape[3] != 3:
@@ -142,9 +142,9 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     write(path, mediapy.compress_video(even, codec="h264", fps=fps, crf=23, ffmpeg_args="-movflags +faststart"))
 
 
-def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **positive: Number) -> None:
-    for name, value in positive.items():
-        within(name, value, 0, np.inf, "positive")
+def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **numbers: Number) -> None:
+    for name, value in numbers.items():
+        positive(name, value)
     if positions.ndim != 2 or positions.shape[1] != mj_model.nq or not len(positions):
         raise ValueError(f"qpos must have shape (states, nq) = (at least 1, {mj_model.nq}), got {positions.shape}")
     if not np.isfinite(positions).all():
