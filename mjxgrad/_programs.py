@@ -35,17 +35,9 @@ def is_traced(arguments: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
 
 
-class Form:
-    """A tree without its arrays; called with arrays it is the tree again. It equals itself alone."""
-
-    def __init__(self, static: Any, structure: Any):
-        self.static, self.structure = static, structure
-
-    def __call__(self, leaves: Sequence[Any]) -> Any:
-        return eqx.combine(jax.tree.unflatten(self.structure, leaves), self.static)
-
-
-_FORMS: collections.OrderedDict[Any, Form] = collections.OrderedDict()
+Form = Callable[[Sequence[Any]], Any]
+"""A tree without its arrays: a function from arrays to the tree, equal to itself alone."""
+_FORMS: collections.OrderedDict[Any, tuple[Form, Any]] = collections.OrderedDict()
 _MOST_KEPT = 64
 
 
@@ -57,13 +49,17 @@ def parted(tree: Any, *, trusts_hash: bool = False) -> tuple[list[jax.Array], Fo
     """
     arrays, static = eqx.partition(tree, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
-    form = Form(static, structure)
+    seen: dict[int, tuple[int, Any]] = {}  # kept with the form, so that its identities stay their own
+
+    def form(leaves: Sequence[Any]) -> Any:
+        return eqx.combine(jax.tree.unflatten(structure, leaves), static)
+
     try:
-        key = _content(static, {})
+        key = _content(static, seen)
     except _UnknownError:
         key = (structure, *jax.tree.leaves(static)) if trusts_hash else form
     try:
-        form = _FORMS.setdefault(key, form)
+        form, _ = _FORMS.setdefault(key, (form, seen))
     except TypeError:  # no hash
         return leaves, form
     if len(_FORMS) > _MOST_KEPT:
@@ -75,19 +71,6 @@ class _UnknownError(Exception):
     """Something may change without a trace."""
 
 
-class _Same:
-    """Something that is equal to itself alone."""
-
-    def __init__(self, value: Any):
-        self.value = value
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-    def __eq__(self, other: Any) -> bool:
-        return isinstance(other, _Same) and other.value is self.value
-
-
 def _content(value: Any, seen: dict[int, tuple[int, Any]]) -> Any:
     """Return a key that is equal for equal content; what was seen is named by its number, also within itself."""
     if isinstance(value, _ATOMS):
@@ -96,15 +79,16 @@ def _content(value: Any, seen: dict[int, tuple[int, Any]]) -> Any:
         return "seen", seen[id(value)][0]
     seen[id(value)] = len(seen), value
     of = lambda *parts: tuple(_content(part, seen) for part in parts)  # noqa: E731
+    itself = "itself", id(value)
     if isinstance(value, np.ndarray | jax.Array):
-        return _digest(value)
+        return digest(value)
     if isinstance(value, mujoco.MjModel):
         content = np.empty(mujoco.mj_sizeModel(value), np.uint8)
         mujoco.mj_saveModel(value, None, content)
-        return _digest(content)
+        return digest(content)
     is_made_once = "<locals>" not in getattr(value, "__qualname__", "")
     if isinstance(value, types.ModuleType | type | types.FunctionType) and is_made_once and _is_installed(value):
-        return _Same(value)
+        return itself
     if isinstance(value, types.FunctionType):
         outside = {} if _is_installed(value) else _outside(value.__globals__, _names(value.__code__), [])
         try:
@@ -125,13 +109,13 @@ def _content(value: Any, seen: dict[int, tuple[int, Any]]) -> Any:
             x for k, x in vars(value).items() if not k.startswith(("__", "_abc")) or k in ("__call__", "__init__")
         ]
         inner = [getattr(x, "method", getattr(x, "fget", getattr(x, "__func__", x))) for x in members]
-        return _Same(value), *of(value.__bases__, inner)
+        return itself, *of(value.__bases__, inner)
     if hasattr(value, "__wrapped__"):  # a compiled function
-        return _Same(value), *(() if _is_installed(value) else of(value.__wrapped__))
+        return itself, *(() if _is_installed(value) else of(value.__wrapped__))
     if state := getattr(value, "__dict__", None):
         return of(type(value), state)
     if isinstance(value, np.ufunc) or isinstance(getattr(value, "__self__", None), types.ModuleType):
-        return _Same(value)
+        return itself
     if type(value).__hash__ in (None, object.__hash__):
         raise _UnknownError
     return type(value), value
@@ -151,15 +135,14 @@ def _outside(space: Mapping[str, Any], names: set[str], within: list[Any]) -> di
     return found
 
 
-def _digest(value: Any) -> tuple:
-    if isinstance(value, jax.core.Tracer):
+def digest(value: Any) -> tuple:
+    """Return the type and shape of an array, and a hash of its numbers."""
+    if isinstance(value, jax.core.Tracer) or value.dtype == object:
         raise _UnknownError
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        return "key", str(value.dtype), *_digest(jax.random.key_data(value))
-    if value.dtype == object:
-        raise _UnknownError
-    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).digest()
-    return str(value.dtype), value.shape, getattr(value, "weak_type", None), content
+        return "key", str(value.dtype), *digest(jax.random.key_data(value))
+    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    return str(value.dtype), value.shape, getattr(value, "weak_type", False), content
 
 
 def _is_installed(value: Any) -> bool:
@@ -202,11 +185,12 @@ def patiently(call: Callable[[], Any]) -> Any:
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
-    found: Future[Any] = Future()
+    found, is_double = Future(), jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
     def work() -> None:
         try:
-            found.set_result(call())
+            with jax.enable_x64(is_double):  # a thread does not see settings made by `with`
+                found.set_result(call())
         except BaseException as error:
             found.set_exception(error)
 
@@ -241,11 +225,11 @@ def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> ja
     """
     text = lowered.as_text()
     if "callback" in text:
-        return lowered.compile(compiler_options=options)
+        return patiently(lambda: lowered.compile(compiler_options=options))
     shapes = str(jax.tree.leaves(lowered.args_info))
     key = (hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, shapes)
     if key not in _KEPT:
-        _KEPT[key] = lowered.compile(compiler_options=options)
+        _KEPT[key] = patiently(lambda: lowered.compile(compiler_options=options))
     _KEPT.move_to_end(key)
     if len(_KEPT) > _MOST_KEPT:
         _KEPT.popitem(last=False)

@@ -19,7 +19,6 @@ from mjxgrad._arrays import whole
 from mjxgrad.estimators.moments import Moments
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
-from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective, OpenLoop, ParameterNoise
 from mjxgrad.objective.base import as_objective, positive
 
@@ -45,7 +44,7 @@ class Population(Descent):
     def init_state(self, params: Float[Array, " dim"]) -> Float[Array, " dim"]:
         return self.stddev.astype(params.dtype)
 
-    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Float[Array, ""]]]:
+    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, Record]:
         params, width = carry.params, carry.state
         search_key, rollout_key = jax.random.split(jax.random.fold_in(carry.key, index))
         objective = self.objective.sized_for(params)
@@ -115,7 +114,7 @@ def cross_entropy(
         return elite.mean(axis=0), elite.std(axis=0)
 
     method = Population(RunOptions.of(num_steps, options), objective, width, move, num_samples, least_finite=num_elite)
-    return run(method, **method.begun(params, key))
+    return method.run(params, key)
 
 
 def search_stddev(

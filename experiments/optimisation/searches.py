@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, Key
 from mjxgrad.baselines import Population, cross_entropy, search_stddev
 from mjxgrad.loop import Optimisation
 from mjxgrad.loop.descent import RunOptions
-from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective
 
 __all__ = ["cross_entropy", "mppi", "predictive_sampling"]
@@ -57,7 +56,7 @@ def mppi(
         return mean + jax.nn.softmax(-costs / scale) @ (at - mean), stddev
 
     method = Population(RunOptions(num_steps, **options), objective, width, move, num_samples)
-    return run(method, **method.begun(params, key))
+    return method.run(params, key)
 
 
 def predictive_sampling(
@@ -87,4 +86,4 @@ def predictive_sampling(
     method = Population(
         RunOptions(num_steps, **options), objective, width, move, num_samples, least_finite=1, has_present=True
     )
-    return run(method, **method.begun(params, key))
+    return method.run(params, key)

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function, one_of, whole
-from mjxgrad._programs import Form, is_traced, parted
+from mjxgrad._programs import compiled, is_traced
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
-from mjxgrad.loop.run import Log, Method, Progress, mean
+from mjxgrad.loop.run import Log, Method, Progress, mean, run
 from mjxgrad.objective.base import Scalar, Vector, as_scalar, check_vector
 
 # Progress is shown every five per cent; each time costs one return from the device.
@@ -86,8 +86,8 @@ class Descent(Method):
     def init_state(self, params: Vector) -> PyTree:
         """Return the first state of the method, carried from step to step beside the parameters."""
 
-    def begun(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> dict[str, Any]:
-        """Return the arguments of `run` besides the method; with a leading axis of keys, one start per key."""
+    def run(self, params: Float[Array, "..."], key: Key[Array, "..."]) -> Optimisation:
+        """Run the method from a vector; with a leading axis of keys, one start per key."""
         if is_traced((self, params, key)):
             raise ValueError(
                 "optimise must be called outside of jax.jit and jax.vmap, got a traced value; it compiles its own program, "
@@ -108,12 +108,9 @@ class Descent(Method):
         check_vector(params.shape[params.ndim == 2 :], params.dtype)
         if not jnp.isfinite(params).all():
             raise ValueError(f"params must be finite at the start, got {params}")
-        return {
-            "start": (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key),
-            "over": [None] * key.ndim,
-            "segment": math.ceil(self.options.num_steps / NUM_SEGMENTS),
-            **{name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint", "progress")},
-        }
+        options = {name: getattr(self.options, name) for name in ("num_steps", "log", "checkpoint", "progress")}
+        options |= {"over": [None] * key.ndim, "segment": math.ceil(self.options.num_steps / NUM_SEGMENTS)}
+        return run(self, (jnp.broadcast_to(params, (*key.shape, params.shape[-1])), key), **options)
 
     def init(self, start: tuple[Vector, PRNGKeyArray]) -> Carry:
         params, key = start
@@ -124,18 +121,18 @@ class Descent(Method):
 
     def moved(
         self, carry: Carry, index: Int[Array, ""], params: Vector, state: PyTree, record: Record
-    ) -> tuple[Carry, tuple[Record, Scalar]]:
+    ) -> tuple[Carry, Record]:
         """Return the carry after a step, and the record of the step; nothing changes where a run has stopped.
 
         `params` and `state` are those after the step; unchanged, with `record.is_taken` False, if it could not be taken.
         """
         options, at, nan = self.options, carry.params, jnp.full((), jnp.nan, carry.params.dtype)
-        noise_free, candidate = nan, Best(at, record.cost, record.scale, record.finite_fraction)
+        candidate = Best(at, record.cost, record.scale, record.finite_fraction)
         if (evaluate := options.evaluate) is not None:
             is_due = index % options.evaluate_every == 0
             cost = lambda x: as_scalar(evaluate(x), "evaluate").astype(x.dtype)  # noqa: E731
-            noise_free = jax.lax.cond(is_due, cost, lambda _: nan, at)
-            candidate = Best.measured(at, noise_free)
+            record = dataclasses.replace(record, noise_free_cost=jax.lax.cond(is_due, cost, lambda _: nan, at))
+            candidate = Best.measured(at, record.noise_free_cost)
         num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
         num_still = jnp.where(record.reason == Reason.nothing_felt, carry.num_still + 1, 0)
         # Later reasons to stop override earlier ones. That all steps are done is no part of it: a run may go on with more.
@@ -145,7 +142,7 @@ class Descent(Method):
         best = carry.best.against(candidate)
         after = Carry(params, state, carry.key, best, num_in_a_row, num_still, stopped)
         # One of several runs may have stopped before the others.
-        as_it_was, as_it_is = (carry, (Record.blank(at.dtype), nan)), (after, (record, noise_free))
+        as_it_was, as_it_is = (carry, Record.blank(at.dtype)), (after, record)
         return jax.tree.map(lambda old, new: jnp.where(self.is_over(carry), old, new), as_it_was, as_it_is)
 
     def is_over(self, carry: Carry) -> Bool[Array, "..."]:
@@ -173,8 +170,7 @@ class Descent(Method):
         at_end = chosen(carry.num_in_a_row >= num_steps, Stopped.not_finite, at_end)
         stopped = chosen(carry.stopped == Stopped.running, at_end, carry.stopped)
         if self.options.evaluate is not None and not progress.is_interrupted:
-            numbers, form = parted(self.options.evaluate)
-            final_cost, best = _finish(form, carry.params.ndim == 2)(numbers, carry.params, best)
+            final_cost, best = _finish(self.options.evaluate, carry.params, best)
         return Optimisation(
             params=carry.params,
             best_params=best.params,
@@ -191,12 +187,12 @@ class Descent(Method):
         )
 
 
-@functools.lru_cache(maxsize=16)
-def _finish(evaluate: Form, is_many: bool) -> Callable[[list[Array], Vector, Best], tuple[Scalar, Best]]:
-    """Return the program that measures the last point, which competes with the best before."""
+@compiled
+def _finish(evaluate: Any, params: Float[Array, "*seeds dim"], best: Best) -> tuple[Float[Array, "*seeds"], Best]:
+    """Measure the last point, of many seeds each; it competes with the best before."""
 
-    def finish(numbers: list[Array], at: Vector, best: Best) -> tuple[Scalar, Best]:
-        cost = as_scalar(evaluate(numbers)(at), "evaluate").astype(at.dtype)
+    def finish(at: Vector, best: Best) -> tuple[Scalar, Best]:
+        cost = as_scalar(evaluate(at), "evaluate").astype(at.dtype)
         return cost, best.against(Best.measured(at, cost))
 
-    return jax.jit(jax.vmap(finish, (None, 0, 0)) if is_many else finish)
+    return (jax.vmap(finish) if params.ndim == 2 else finish)(params, best)

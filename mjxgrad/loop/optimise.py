@@ -15,7 +15,6 @@ from mjxgrad._arrays import function, instance, one_key, takes
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
-from mjxgrad.loop.run import run
 from mjxgrad.objective import Objective, flattened, of_vector
 from mjxgrad.objective.base import Restored, Scalar, Vector, as_objective
 
@@ -76,12 +75,10 @@ def optimise(
     """
     vector, restore = flattened(params, 1 + jnp.ndim(key))
     chosen = RunOptions.of(num_steps, options)
-    if restore is not None and chosen.evaluate is not None:
+    if chosen.evaluate is not None:
         chosen = dataclasses.replace(chosen, evaluate=Restored(chosen.evaluate, restore))
     method = GradientStep(chosen, of_vector(objective, restore), estimator, optimiser, annealing)
-    result = run(method, **method.begun(vector, key))
-    if restore is None:
-        return result
+    result = method.run(vector, key)
     return dataclasses.replace(result, params=restore(result.params), best_params=restore(result.best_params))
 
 
@@ -113,15 +110,12 @@ class GradientStep(Descent):
         if not takes(self.estimator, "memory"):
             return state, None
         zero = jnp.zeros((), jnp.int32)
-        shapes = jax.eval_shape(
-            lambda at: self.estimated(self.objective, at, jax.random.key(0), zero)[1].memory, params
-        )
+        shapes = jax.eval_shape(lambda at: self.estimated(at, jax.random.key(0), zero)[1].memory, params)
         return state, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, tuple[Record, Scalar]]:
-        inner, memory = carry.state
-        scale, estimate = self.estimated(self.objective, carry.params, carry.key, index, memory)
-        change, inner, is_taken = self.change(carry.params, inner, estimate, estimate.value)
+    def step(self, carry: Carry, index: Int[Array, ""]) -> tuple[Carry, Record]:
+        scale, estimate = self.estimated(carry.params, carry.key, index, carry.state[1])
+        change, state, is_taken = self.change(carry.params, carry.state, estimate, estimate.value)
         dtype = carry.params.dtype
         record = Record(
             cost=estimate.objective_mean.astype(dtype),
@@ -135,16 +129,15 @@ class GradientStep(Descent):
             num_rollouts=estimate.num_rollouts.astype(jnp.int32),
             num_gradient_rollouts=estimate.num_gradient_rollouts.astype(jnp.int32),
             is_taken=is_taken,
+            noise_free_cost=jnp.full((), jnp.nan, dtype),
         )
-        return self.moved(
-            carry, index, carry.params + change, (inner, None if memory is None else estimate.memory), record
-        )
+        return self.moved(carry, index, carry.params + change, state, record)
 
     def estimated(
-        self, objective: Any, params: Vector, key: PRNGKeyArray, step: Int[Array, ""], memory: PyTree = None
+        self, params: Vector, key: PRNGKeyArray, step: Int[Array, ""], memory: PyTree = None
     ) -> tuple[Scalar, GradientEstimate]:
         """Return the scale of a step, 1 without annealing, and the estimate at this scale."""
-        scale = jnp.ones((), params.dtype)
+        scale, objective = jnp.ones((), params.dtype), self.objective
         if self.annealing is not None:
             scale = jnp.asarray(self.annealing(step), params.dtype)
             objective = objective(scale)
@@ -155,22 +148,24 @@ class GradientStep(Descent):
         return scale, jax.tree.map(jnp.asarray, estimate)
 
     def change(
-        self, params: Vector, state: PyTree, estimate: GradientEstimate, gradient: Vector
-    ) -> tuple[Vector, PyTree, Bool[Array, ""]]:
-        """Return the optimiser's change of the parameters, its state after, and whether the step is taken.
+        self, params: Vector, state: tuple[PyTree, PyTree], estimate: GradientEstimate, gradient: Vector
+    ) -> tuple[Vector, tuple[PyTree, PyTree], Bool[Array, ""]]:
+        """Return the optimiser's change of the parameters, the state after it, and whether the step is taken.
 
         The gradient is the sum of the estimate and of the gradient of anything else in the cost.
         """
+        inner, memory = state
         is_finite = jnp.isfinite(gradient).all()
         # NaN must not reach the optimiser: its behaviour is then undefined, even if the result is discarded.
         gradient = jnp.where(is_finite, gradient, 0).astype(params.dtype)
         # `reduce_on_plateau` needs the cost.
         update = optax.with_extra_args_support(self.optimiser).update
-        updates, moved = update(gradient, state, params, value=estimate.objective_mean)
+        updates, moved = update(gradient, inner, params, value=estimate.objective_mean)
         change = jnp.asarray(updates)
         is_taken = is_finite & jnp.isfinite(params + change).all()
-        moved = jax.tree.map(lambda new, old: jnp.where(is_taken, new, old), moved, state)
-        return jnp.where(is_taken, change, 0).astype(params.dtype), moved, is_taken
+        moved = jax.tree.map(lambda new, old: jnp.where(is_taken, new, old), moved, inner)
+        kept = moved, None if memory is None else estimate.memory
+        return jnp.where(is_taken, change, 0).astype(params.dtype), kept, is_taken
 
 
 class EstimatedGradientState(eqx.Module):
@@ -219,31 +214,27 @@ def estimated_gradient(
     one_key(key)
     rule = GradientStep(RunOptions(1), objective, estimator, optimiser or optax.identity(), annealing)
 
-    def estimated(params: PyTree, step: Int[Array, ""], memory: PyTree = None) -> tuple[Scalar, GradientEstimate]:
+    def of_form(params: PyTree) -> tuple[GradientStep, Vector, Any]:
         vector, restore = flattened(params)
-        return rule.estimated(of_vector(objective, restore), vector, key, step, memory)
+        return dataclasses.replace(rule, objective=of_vector(objective, restore)), vector, restore
 
     def init(params: PyTree) -> EstimatedGradientState:
-        zero = jnp.zeros((), jnp.int32)
-        vector, restore = flattened(params)
-        inner = dataclasses.replace(rule, objective=of_vector(objective, restore)).init_state(vector)
-        shapes = jax.eval_shape(lambda step: estimated(params, step), zero)
+        zero, (own, vector, _) = jnp.zeros((), jnp.int32), of_form(params)
+        shapes = jax.eval_shape(lambda step: own.estimated(vector, key, step), zero)
         nothing = lambda x: jnp.full(x.shape, jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else 0, x.dtype)  # noqa: E731
         scale, estimate = jax.tree.map(nothing, shapes)
-        return EstimatedGradientState(zero, zero, scale, estimate, inner)
+        return EstimatedGradientState(zero, zero, scale, estimate, own.init_state(vector))
 
     def update(
         updates: PyTree, state: EstimatedGradientState, params: PyTree = None, **_: Any
     ) -> tuple[PyTree, EstimatedGradientState]:
         if params is None:
             raise ValueError("params must be given to update, got None: the gradient is estimated there")
-        vector, restore = flattened(params)
-        inner, memory = state.inner
-        scale, estimate = estimated(params, state.step, memory)
+        own, vector, restore = of_form(params)
+        scale, estimate = own.estimated(vector, key, state.step, state.inner[1])
         gradient = estimate.value if updates is None else estimate.value + flattened(updates)[0]
-        change, inner, is_taken = rule.change(vector, inner, estimate, gradient)
-        kept = (inner, None if memory is None else estimate.memory)
-        moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, kept)
-        return change if restore is None else eqx.filter(restore(change), eqx.is_inexact_array), moved
+        change, inner, is_taken = own.change(vector, state.inner, estimate, gradient)
+        moved = EstimatedGradientState(state.step + 1, state.num_skipped + ~is_taken, scale, estimate, inner)
+        return eqx.filter(restore(change), eqx.is_inexact_array), moved
 
     return optax.GradientTransformationExtraArgs(init, update)  # pyright: ignore[reportArgumentType]

@@ -48,6 +48,7 @@ class Record(eqx.Module):
         num_rollouts: rollouts spent by the step.
         num_gradient_rollouts: rollouts that were differentiated.
         is_taken: False for a step whose estimate was not finite.
+        noise_free_cost: result of `evaluate` at the parameters before the step, NaN where it was not due.
     """
 
     cost: Numbers
@@ -61,6 +62,7 @@ class Record(eqx.Module):
     num_rollouts: Counts
     num_gradient_rollouts: Counts
     is_taken: Bool[Any, "..."]
+    noise_free_cost: Numbers
 
     @classmethod
     def blank(cls, dtype: jnp.dtype) -> "Record":
@@ -68,7 +70,7 @@ class Record(eqx.Module):
         nan, none = jnp.full((), jnp.nan, dtype), jnp.zeros((), jnp.int32)
         # As an array, like the reasons of steps.
         reason = jax.tree.map(jnp.asarray, Reason.fixed)
-        return cls(nan, nan, nan, nan, reason, nan, nan, nan, none, none, jnp.zeros((), bool))
+        return cls(nan, nan, nan, nan, reason, nan, nan, nan, none, none, jnp.zeros((), bool), nan)
 
 
 class Best(eqx.Module):
@@ -104,11 +106,9 @@ class History(Record, Printed):
     are NaN and its counts stay constant.
 
     Attributes:
-        noise_free_cost: result of `evaluate` at the parameters before the step, NaN where it was not due.
         seconds: wall-clock time up to the end of the step, the same for all seeds; see `Progress`.
     """
 
-    noise_free_cost: Float[np.ndarray, "..."]
     seconds: Float[np.ndarray, " steps"]
 
     def __str__(self) -> str:
@@ -128,12 +128,12 @@ class History(Record, Printed):
     @classmethod
     def of(cls, progress: Progress) -> "History":
         """Return the history from the records of a descent."""
-        records, noise_free_cost = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), progress.found)
+        records = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), progress.found)
         fields = {field.name: getattr(records, field.name) for field in dataclasses.fields(Record)}
         for name in ("num_rollouts", "num_gradient_rollouts"):
             # In 64 bits: long runs of large batches exceed 2³¹ rollouts.
             fields[name] = np.cumsum(fields[name], axis=-1, dtype=np.int64)
-        return cls(**fields, noise_free_cost=noise_free_cost, seconds=np.cumsum(progress.seconds))
+        return cls(**fields, seconds=np.cumsum(progress.seconds))
 
 
 class Optimisation(eqx.Module, Paged):

@@ -25,12 +25,12 @@ from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from mjxgrad._arrays import function, instance
-from mjxgrad._programs import Form, parted, patiently
+from mjxgrad._programs import Form, digest, parted, patiently
 from mjxgrad._text import duration, write
 from mjxgrad.batched.device import all_devices
 
 Log = Callable[[int, dict[str, float]], Any]
-_FORMAT = 3  # of checkpoints
+_FORMAT = 4  # of checkpoints
 _PARTS = {
     "program": "a rate or other number, or the code, of environment, objective, estimator or optimiser, or a library's version",
     "arrays": "arrays in environment, objective or method",
@@ -107,7 +107,7 @@ def side_by_side(methods: Sequence[Any]) -> tuple[Any, list[int | None]]:
     if not all(eqx.tree_equal(parts[0][1], other) for _, other in parts):
         raise ValueError("methods side by side must differ in numbers alone; run each separately")
     numbers = list(zip(*(jax.tree.leaves(arrays) for arrays, _ in parts), strict=True))
-    is_common = [len(set(map(_digest, each))) == 1 for each in numbers]
+    is_common = [len(set(map(digest, each))) == 1 for each in numbers]
     joined = [each[0] if same else jnp.stack(each) for each, same in zip(numbers, is_common, strict=True)]
     arrays = jax.tree.unflatten(jax.tree.structure(parts[0][0]), joined)
     return eqx.combine(arrays, parts[0][1]), [None if same else 0 for same in is_common]
@@ -166,7 +166,7 @@ def run(
         # Classes of one name may differ in code. The lowered program has every number that is no argument, such as a rate.
         text = np.frombuffer(traced.lower().as_text().encode(), np.uint8)
         parts = {"start": start, "arrays": eqx.filter(method.shared(), eqx.is_array), "program": text}
-        identity = method.identity() | {name: _digest(part) for name, part in parts.items()}
+        identity = method.identity() | {name: _short(part) for name, part in parts.items()}
     if path is not None and path.exists():
         carry, found, seconds = _load(path, done[:3], identity)
         if not all(np.isfinite(x).all() for x in jax.tree.leaves(method.learnt(carry))):
@@ -370,14 +370,9 @@ def _load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(like), [_restored(x, y) for x, y in zip(leaves, wanted, strict=True)])
 
 
-def _digest(tree: PyTree) -> str:
+def _short(tree: PyTree) -> str:
     """Return a short hash of the content of arrays."""
-    sha = hashlib.sha256()
-    for leaf in jax.tree.leaves(tree):
-        array = _as_numpy(leaf)
-        sha.update(f"{array.dtype}{array.shape}".encode())
-        sha.update(np.ascontiguousarray(array).tobytes())
-    return sha.hexdigest()[:16]
+    return hashlib.sha256(repr([digest(leaf) for leaf in jax.tree.leaves(tree)]).encode()).hexdigest()[:16]
 
 
 def _as_numpy(leaf: Any) -> np.ndarray:

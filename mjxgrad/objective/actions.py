@@ -151,7 +151,7 @@ class OpenLoop(ActionNoise):
         return self.unravel(params), None
 
     def score(self, params: Vector, noise: PyTree) -> Vector:
-        return self._noise_score(params, noise)
+        return self.pull_back_at(params, None)(self._noise_score(params, noise))
 
     def pull_back_at(self, params: Vector, states: PyTree) -> Partial:
         return Partial(unchanged)  # the parameters are the controls
@@ -248,17 +248,12 @@ class _OfVector(eqx.Module):
 def _flat(params: PyTree) -> tuple[Vector, Callable[[Vector], PyTree]]:
     if all(map(eqx.is_array_like, jax.tree.leaves(params))):
         return ravel_pytree(params)  # its `unravel` equals that of any pytree of the same structure
-    vector, restore = flattened(params)
-    assert restore is not None
-    return vector, restore
+    return flattened(params)
 
 
 @dataclasses.dataclass(frozen=True)
 class _ActionsTranspose:
-    """The transpose of the derivative of the mean actions by the parameters, at given states.
-
-    Equal settings must give equal pytrees, which two closures never are, nor the residuals of two traces of `jax.vjp`.
-    """
+    """The transpose of the derivative of the mean actions at given states; equal settings are equal, which closures never are."""
 
     unravel: Callable[[Vector], PyTree]
 

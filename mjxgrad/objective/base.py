@@ -4,8 +4,8 @@ Noise smooths a cost: $F(\theta) = \mathbb{E}[f(\theta, w)]$. The score $s$ is t
 quantity by $\theta$; it satisfies $\mathbb{E}[s] = 0$ and $\nabla F = \mathbb{E}[f s]$.
 """
 
+import contextlib
 import dataclasses
-import functools
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -183,22 +183,16 @@ def value_and_gradient(
     function: Callable[[Vector], Any], point: Vector, *, has_aux: bool = False
 ) -> tuple[Any, Vector]:
     """Differentiate as `jax.value_and_grad` does, in forward mode up to three dimensions if the function has one."""
+
+    def both(at: Vector) -> tuple[Scalar, Any]:
+        found = function(at)
+        value = as_scalar(found[0] if has_aux else found, "function")
+        return value, (value, found[1]) if has_aux else value
+
     if point.size <= MOST_FORWARD_DIMENSIONS:
-        along = functools.partial(jax.jvp, function, (point,), has_aux=has_aux)
-        out_axes = (None, 0, None) if has_aux else (None, 0)
-        try:
-            value, gradient, *besides = jax.vmap(along, out_axes=out_axes)((jnp.eye(point.size, dtype=point.dtype),))
-        except TypeError:  # jax.custom_vjp has no forward mode; any other TypeError is raised again below
-            pass
-        else:
-            value = as_scalar(value, "function")
-            if gradient.dtype == jax.dtypes.float0:  # the tangent of an integer
-                gradient = jnp.zeros_like(point)
-            return (value, *besides) if has_aux else value, gradient
-    found, pull_back, *besides = jax.vjp(function, point, has_aux=has_aux)
-    value = as_scalar(found, "function")
-    (gradient,) = pull_back(jnp.ones_like(found))
-    return (value, *besides) if has_aux else value, gradient
+        with contextlib.suppress(TypeError):  # jax.custom_vjp has no forward mode; any other is raised again below
+            return jax.jacfwd(both, has_aux=True)(point)[::-1]
+    return jax.grad(both, has_aux=True)(point)[::-1]
 
 
 def gaussian(key: PRNGKeyArray, stddev: Float[Array, "..."], shape: tuple[int, ...]) -> Float[Array, "..."]:
@@ -271,15 +265,13 @@ class Restored(eqx.Module):
         return self.function(self.restore(vector))
 
 
-def flattened(
-    params: PyTree, num_axes: int = 1
-) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree] | None]:
-    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; or a vector, None.
+def flattened(params: PyTree, num_axes: int = 1) -> tuple[Float[Array, "..."], Callable[[Float[Array, "..."]], PyTree]]:
+    """Return the floating-point arrays of a pytree as a vector, with its inverse, also for one per seed; a vector unchanged.
 
     An array with more axes than a vector, or than one vector per seed, is a pytree, too: controls by step and actuator.
     """
     if eqx.is_array_like(params) and jnp.ndim(params) <= num_axes:
-        return jnp.asarray(params), None
+        return jnp.asarray(params), unchanged
     # `is_inexact_array_like` calls a tracer's `__jax_array__`, which is None (jax 0.10.2, equinox 0.13.8).
     is_parameter = lambda x: eqx.is_inexact_array(x) if eqx.is_array(x) else eqx.is_inexact_array_like(x)  # noqa: E731
     arrays, others = eqx.partition(params, is_parameter)
@@ -293,22 +285,18 @@ def flattened(
     return vector, restore
 
 
-def of_vector(objective: Any, restore: Callable[[Vector], PyTree] | None) -> Any:
+def of_vector(objective: Any, restore: Callable[[Vector], PyTree]) -> Any:
     """Return an objective, or a function from a scale to one, that takes the vector of `flattened`.
 
     An objective with noise on actions is unchanged: it takes a vector already, and restores its policy's parameters itself.
     """
-    if restore is None or not (callable(objective) or isinstance(objective, ParameterNoise)):
-        return objective
     if isinstance(objective, ParameterNoise):
         return dataclasses.replace(objective, function=Restored(objective.function, restore))
-    return lambda scale: of_vector(objective(scale), restore)
+    return (lambda scale: of_vector(objective(scale), restore)) if callable(objective) else objective
 
 
 def as_vector(objective: Objective, params: PyTree) -> tuple[Objective, Vector, Callable[[Vector], PyTree]]:
     """Return an objective of a vector, sized for it, the vector, and the map from a gradient to the parameters' form."""
     vector, restore = flattened(params)
     objective = of_vector(as_objective(objective), restore).sized_for(vector)
-    if restore is None:
-        return objective, vector, unchanged
     return objective, vector, lambda gradient: eqx.filter(restore(gradient), eqx.is_inexact_array)

@@ -155,17 +155,8 @@ class SceneTask(Task, InScene):
             ValueError: if the cost is neither a number nor one number per state.
         """
         start = self.state if start is None else start
-        trajectory = rollout(
-            self.scene,
-            start,
-            controls,
-            params,
-            noise,
-            horizon=self.horizon,
-            observe=self.observe,
-            policy_sees=self.policy_sees,
-            contact=self.contact,
-        )
+        how: Any = {name: getattr(self, name) for name in ("horizon", "observe", "policy_sees", "contact")}
+        trajectory = rollout(self.scene, start, controls, params, noise, **how)
         states = trajectory.seen
         if states is None:
             qpos, qvel, act = (x[:-1] for x in (trajectory.qpos, trajectory.qvel, jnp.asarray(trajectory.act)))
