@@ -4,12 +4,12 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjxgrad._programs import patiently
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured, Slope, nearest, slopes
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of
@@ -19,10 +19,6 @@ from mjxgrad.engines.state import LARGEST_GROWTH
 from mjxgrad.rollouts import rollout
 from mjxgrad.scene import Scene, SceneError, load_scene
 
-Kind = Literal[
-    "time_step", "jump", "no_contact", "no_effect", "explodes", "not_finite", "many_pairs",
-    "cost", "engines", "not_measured", "left_out", "slope", "price", "order", "note",
-]  # fmt: skip
 _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
@@ -36,7 +32,7 @@ _DISAGREES = 0.1  # relative difference beyond which the slopes at two time step
 class Finding:
     """A finding: its kind, a sentence or two about the scene, and whether it is a fault."""
 
-    kind: Kind
+    kind: str
     text: str
     is_fault: bool = False
 
@@ -144,7 +140,7 @@ def engine_finding(scene: Scene, motions: Motions) -> Finding:
     at = rng.choice(whole, _NUM_COMPARED), rng.integers(motions.controls.shape[1], size=_NUM_COMPARED)
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motions.state, *(one.tolist() for one in at)))
     step = jax.jit(jax.vmap(lambda state, control: rollout(scene, state, control[None]).qvel[-1]))
-    ours = np.asarray(step(states, motions.controls[at]))
+    ours = np.asarray(patiently(lambda: step(states, motions.controls[at])))  # compiles for up to a minute
     theirs = run(scene, start_of(states), motions.controls[at][:, None])["qvel"][:, 1]
     off = np.abs(ours - theirs) / np.maximum(np.abs(theirs).max(axis=1, keepdims=True), 1)
     place, dof = np.unravel_index(off.argmax(), off.shape)
@@ -293,12 +289,12 @@ def recommend(
 def _steps_too_long(stability: StabilityReport) -> list[Spring]:
     """Return the springs for which the time step is too long, one of each group of equal ones."""
     found = [one for one in stability.springs if _largest_step(one) < one.timestep * (1 - 1e-6)]
-    return list({(one.kind, one.given, round(one.coupled_load, 6), one.stiffness): one for one in found}.values())
+    return list({(one.kind, one.replaced, round(one.coupled_load, 6), one.stiffness): one for one in found}.values())
 
 
 def _largest_step(spring: Spring) -> float:
     """Return the longest time step in s that resolves a spring: as its file asks, stable, and not passing through."""
-    asked = spring.given / 2 if spring.is_hidden and spring.given is not None else math.inf
+    asked = math.inf if spring.replaced is None else spring.replaced / 2
     passed = spring.size / spring.speed if spring.speed and spring.kind == "contact" else math.inf
     return min(asked, spring.timestep / spring.coupled_load if spring.coupled_load >= 1 else math.inf, passed)
 
@@ -306,8 +302,8 @@ def _largest_step(spring: Spring) -> float:
 def _time_step(spring: Spring) -> str:
     step, needed = 1e3 * spring.timestep, format_number(1e3 * _largest_step(spring))
     what = f"The time step of {step:g} ms is too long for {spring.kind} {spring.name}"
-    if spring.is_hidden and spring.given is not None:
-        asked, used = (format_number(1e3 * t) for t in (spring.given, spring.time_constant))
+    if spring.replaced is not None:
+        asked, used = (format_number(1e3 * t) for t in (spring.replaced, spring.time_constant))
         return f"{what}: the file asks for a time constant of {asked} ms and gets {used} ms. At most {needed} ms."
     if spring.coupled_load >= 1:
         return f"{what}: it gains energy. Take less than {needed} ms, or a softer contact."

@@ -156,19 +156,10 @@ class BiasVariance(eqx.Module, Printed):
         """First order less reference."""
         return self.first.value - self.reference
 
-    @property
-    def bias_error(self) -> Float[Array, "softness points dim"]:
-        """Standard error of the bias; the errors are independent, for the reference has separate rollouts."""
-        return jnp.hypot(self.first.standard_error, self.reference_error)
-
     def interval(self, name: str) -> Float[np.ndarray, "2 softness points dim"]:
-        """Return Student's t interval of the mean `first`, `zeroth` or `alpha_order`, of the `bias` or the `reference`."""
-        # The reference averages so many cells or samples that its t distribution is normal.
-        if name == "reference":
-            return mean_interval(self.reference, self.reference_error, _NORMAL, self.confidence)
-        one = self.first if name == "bias" else getattr(self, name)
-        found = (self.bias, self.bias_error) if name == "bias" else (one.value, one.standard_error)
-        return mean_interval(*found, one.num_finite[..., None], self.confidence)
+        """Return Student's t interval of the mean `first`, `zeroth` or `alpha_order`; those of biases are in `table`."""
+        one = getattr(self, name)
+        return mean_interval(one.value, one.standard_error, one.num_finite[..., None], self.confidence)
 
     @property
     def knob(self) -> tuple[str, Float[np.ndarray, " softness"]]:
@@ -195,10 +186,11 @@ class BiasVariance(eqx.Module, Printed):
             found.update({name: size, f"{name}_low": low, f"{name}_high": size + half})
             found[name.removesuffix("_bias") + "_is_biased"] = abs(size) > reach
 
+        # The reference averages so many cells or samples that its t distribution is normal.
         add("truth", self.reference, self.reference_error, _NORMAL)
         for name in ESTIMATES:
             if (one := getattr(self, name)) is not None:
-                error = np.hypot(one.standard_error, self.reference_error)
+                error = np.hypot(one.standard_error, self.reference_error)  # independent: of separate rollouts
                 add(f"{name}_bias", one.value - self.reference, error, one.num_finite)
                 low, high = self.variance_intervals[name]
                 found |= {f"{name}_variance": one.variance, f"{name}_variance_low": low, f"{name}_variance_high": high}
@@ -352,7 +344,12 @@ def bias_variance(
     is_line = isinstance(objective, ParameterNoise) and params.shape[1] == 1 and reference is None
     plan = Plan(num_samples, with_zero_noise=not is_line, **wanted)
     units = _rounds(plan)
-    program = functools.partial(_program, objective_of_softness, each[0], params, key)
+
+    def program(part: Callable, *rest: Any) -> Any:
+        """Return a part of the measurement at one softness, ready to be compiled."""
+        measure = lambda one, at, *rest: part(objective_of_softness(one).sized_for(at[0]), at, *rest)  # noqa: E731
+        return jax.jit(measure).lower(each[0], params, key, *rest)
+
     lowered, line = program(functools.partial(_sampled, plan=plan), units[0]), None
     drawn = compile_once(lowered, compiler_options)
     if is_line:
@@ -360,7 +357,7 @@ def bias_variance(
     has_alpha = knows_noise and num_samples >= 2 * BATCH
     longer = lambda x: jax.ShapeDtypeStruct((x.shape[0], len(units) * x.shape[1], *x.shape[2:]), x.dtype)  # noqa: E731
     finish = jax.jit(functools.partial(_summary, plan=plan, has_alpha=has_alpha))
-    summarise = finish.lower(jax.tree.map(longer, lowered.out_info)).compile()
+    summarise = compile_once(finish.lower(jax.tree.map(longer, lowered.out_info)))
     others = range(1, 1 + -(-num_reference // num_samples))
     # C MuJoCo is called back. Two programs that wait for it at once leave JAX no thread on two cores to hand it their numbers.
     num_workers = 1 if "callback" in lowered.as_text() else _WORKERS
@@ -399,7 +396,7 @@ def bias_variance(
     for pieces in filter(None, done):
         empty = [jax.tree.map(jnp.zeros_like, pieces[0][0])] * (len(units) - len(pieces))
         samples = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *(one for one, *_ in pieces), *empty)
-        measured, gathered, batches = summarise(samples)
+        measured, terms = summarise(samples)
         measured["landscape"] = None
         if line is not None:
             measured |= pieces[0][1]
@@ -407,17 +404,17 @@ def bias_variance(
             values, errors = (jnp.stack([jnp.asarray(one[1][k]) for one in pieces]) for k in (0, 1))
             measured["reference"] = values.mean(axis=0)
             measured["reference_error"] = jnp.sqrt((errors**2).sum(axis=0)) / len(pieces)
-        rows.append((measured, _variance_intervals(gathered, batches, confidence)))
+        ends = {k: [bootstrap_variance_interval(x, confidence) for x in np.asarray(one)] for k, one in terms.items()}
+        rows.append((measured, ends))
     # The first of each kind also begins with memory.
     spent = [one[2] for pieces in done for one in (pieces[1:] or pieces)]
     stacked = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
     found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
-    ends = np.stack([row[1] for row in rows], axis=2)
     return BiasVariance(
         **found,
         softness=stacked,
         params=params,
-        variance_intervals=dict(zip(ESTIMATES, ends, strict=False)),
+        variance_intervals={k: np.moveaxis([ends[k] for _, ends in rows], -1, 0) for k in rows[0][1]},
         warnings=told[: len(rows)],
         confidence=confidence,
         share=sum(map(len, done)) / len(jobs),
@@ -450,30 +447,22 @@ def _warned(
     return objectives[-1], tuple(told)
 
 
-def _program(
-    objective_of_softness: Callable[[PyTree], Objective],
-    softness: PyTree,
-    params: Array,
-    key: Any,
-    part: Callable,
-    *rest: Any,
-) -> Any:
-    """Return a part of the measurement at one softness, ready to be compiled."""
-    measure = lambda one, at, *rest: part(objective_of_softness(one).sized_for(at[0]), at, *rest)  # noqa: E731
-    return jax.jit(measure).lower(softness, params, key, *rest)
-
-
-def _summary(samples: Samples, plan: Plan, has_alpha: bool) -> tuple[dict[str, Any], Samples, Array | None]:
-    """Return the estimates from samples at all points, the samples by the parameters, and α-order estimates in batches."""
+def _summary(samples: Samples, plan: Plan, has_alpha: bool) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return the estimates from samples at all points, and by estimate the terms of its mean; NaN in place of missing ones."""
     # The one without noise is the last in what follows, where batches are counted from the first.
     by_noise = jax.tree.map(lambda leaf: jnp.roll(leaf, -plan.with_zero_noise, axis=1), samples)
     samples = jax.vmap(_by_parameters)(by_noise) if plan.by_noise else by_noise
     first, zeroth = jax.vmap(lambda s: both_results(both_summary(s), plan, unchanged))(samples)
-    mixed = (None, None)
+    found = {"first": first, "zeroth": zeroth, "alpha_order": None, "cost": jax.vmap(Samples.noise_free_cost)(samples)}
+    rollouts = jax.tree.map(lambda leaf: leaf[:, :, 0], samples.rollouts)
+    costs = jnp.where(samples.is_noisy & jnp.isfinite(rollouts.cost), rollouts.cost, jnp.nan)[..., None]
+    # Leaving one out is replaced by the mean, equal up to 1/N.
+    terms = {"first": jnp.where(jnp.isnan(costs), jnp.nan, rollouts.gradient_by_noise)}
+    terms["zeroth"] = (costs - jnp.nanmean(costs, axis=1, keepdims=True)) * rollouts.noise_score
     if has_alpha:
-        mixed = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)
-    cost = jax.vmap(Samples.noise_free_cost)(samples)
-    return {"first": first, "zeroth": zeroth, "alpha_order": mixed[0], "cost": cost}, samples, mixed[1]
+        found["alpha_order"], batches = jax.vmap(lambda s, z: _in_batches(s, plan, z))(by_noise, zeroth)
+        terms["alpha_order"] = np.sqrt(BATCH) * batches
+    return found, terms
 
 
 def _sampled(
@@ -559,22 +548,3 @@ def _by_landscape(
     landscape, cost = Landscape(points, costs[:num_reference], cell), costs[num_reference:]
     gradient, error = jax.vmap(landscape.smoothed_gradient, in_axes=(0, None, 0))(params[:, 0], stddev, cost)
     return {"cost": cost, "reference": gradient[:, None], "reference_error": error[:, None], "landscape": landscape}
-
-
-def _variance_intervals(
-    samples: Samples, batches: Array | None, confidence: float
-) -> Float[np.ndarray, "estimates 2 points"]:
-    """Bootstrap the variance per rollout of each estimate at each point; axes: estimate, interval end, point."""
-    intervals = []
-    for i in range(len(samples.is_noisy)):
-        one = jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i], float), samples)
-        is_noisy = one.is_noisy > 0
-        gradients, costs = one.rollouts.gradient_by_noise[is_noisy, 0], one.rollouts.cost[is_noisy, 0]
-        is_finite = np.isfinite(costs)
-        # Leaving one out is replaced by the mean, equal up to 1/N.
-        centre = costs[is_finite].mean() if is_finite.any() else np.nan
-        scored = (costs - centre)[:, None] * one.rollouts.noise_score[is_noisy, 0]
-        terms = [np.where(is_finite[:, None], gradients, np.nan), scored]
-        terms += [] if batches is None else [np.sqrt(BATCH) * np.asarray(batches[i], float)]
-        intervals.append([bootstrap_variance_interval(x, confidence) for x in terms])
-    return np.moveaxis(np.array(intervals), 0, -1)

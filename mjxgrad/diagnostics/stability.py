@@ -32,11 +32,11 @@ _LEAST_FRICTION = 0.01  # of pyramids in single precision
 _STEPS_IN_CONTACT = 6.0  # fewest time steps in a bounce for the slope at MuJoCo's motion
 _WIDTH = 118  # characters in a laptop's terminal
 _COLUMNS = (
-    ("", "k", "b", "ω₀", "ζ", "t_c", "t_c in file", "impedance", "step over", "with all", "bounce"),
-    ("", "1/s²", "1/s", "rad/s", "", "ms", "ms", "", "stable", "contacts", "in steps"),
-)
+    ("", "k", "b", "ω₀", "ζ", "t_c", "t_c in file", "impedance", "step over", "with all", "bounce", "bounce", "force rises"),
+    ("", "1/s²", "1/s", "rad/s", "", "ms", "ms", "", "stable", "contacts", "in steps", "deep", "in steps"),
+)  # fmt: skip
 _LEGEND = "Step over stable: unstable from 1 on; with all contacts of the pair at once. t_c in file: where refsafe replaces it."
-_SPEED_COLUMNS = (("bounce", "force rises"), ("deep", "in steps"))
+
 # Fewest steps that resolve the rise of the impedance, and the largest first impedance that counts as continuous.
 _STEPS_NEEDED, _LARGEST_JUMP = 2.0, 0.01
 
@@ -52,7 +52,7 @@ class Spring:
         damping: effective $b$, in 1/s.
         impedance: $d_0$ and $d_w$.
         width: depth over which the impedance rises, in m (rad for hinges).
-        given: time constant in the file, in s; None in the direct format.
+        replaced: time constant in the file that `refsafe` replaces, in s; None where none is.
         timestep: $h$, in s.
         integrator: integrator of the model.
         size: largest travel in one step that is detected: the bodies' thickness (m); infinite for planes and limits.
@@ -67,7 +67,7 @@ class Spring:
     damping: float
     impedance: tuple[float, float]
     width: float
-    given: float | None
+    replaced: float | None
     timestep: float
     integrator: mujoco.mjtIntegrator
     size: float = math.inf
@@ -111,12 +111,6 @@ class Spring:
             return self.timestep * damping / limit
         frequency = np.sqrt(stiffness)
         return self.timestep * frequency / largest_stable_step(damping / (2 * frequency), self.integrator)
-
-    @property
-    def is_hidden(self) -> bool:
-        """Whether `refsafe` replaces the given time constant."""
-        # A relative margin, because float32 rounds a time constant of exactly two steps.
-        return self.given is not None and self.time_constant > self.given * (1 + 1e-5)
 
     @property
     def num_steps(self) -> float:
@@ -185,10 +179,8 @@ class StabilityReport(Printed):
         lines = [f"Stability of {self.name} at a time step of {format_number(1e3 * self.timestep)} ms{speed}"]
         if not self.springs:
             return "\n".join([*lines, "  nothing to check: no contact, limit or equality"])
-        has_speed = self.speed is not None
-        heads = [one + more * has_speed for one, more in zip(_COLUMNS, _SPEED_COLUMNS, strict=True)]
-        rows = [*heads, *self._rows()]
-        lines += [f"  {line}" for line in aligned(rows)]
+        columns = [column for column in zip(*_COLUMNS, *self._rows(), strict=True) if any(column[2:])]
+        lines += [f"  {line}" for line in aligned(list(zip(*columns, strict=True)))]
         lines += [textwrap.fill(_LEGEND, _WIDTH, initial_indent="  ", subsequent_indent="  ")]
         sentences = self.warnings or ("the time step resolves every spring",)
         lines += [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
@@ -199,24 +191,17 @@ class StabilityReport(Printed):
     def _rows(self) -> Iterator[tuple[str, ...]]:
         groups: dict[tuple[str, ...], list[Spring]] = {}
         for spring in self.springs:
-            groups.setdefault((spring.kind, *self._cells(spring)), []).append(spring)
+            numbers = spring.stiffness, spring.damping, np.sqrt(max(spring.stiffness, 0.0)), spring.damping_ratio
+            cells = [*map(format_number, numbers), format_number(1e3 * spring.time_constant)]
+            cells += ["" if spring.replaced is None else format_number(1e3 * spring.replaced)]
+            cells += [format_range(spring.impedance)]
+            cells += map(format_number, (spring.load, spring.coupled_load, spring.num_steps))
+            if (speed := spring.speed) is not None:
+                cells += [f"{format_number(1e3 * spring.depth(speed))} mm", format_number(spring.rise_steps(speed))]
+            cells += [""] * (len(_COLUMNS[0]) - 1 - len(cells))
+            groups.setdefault((spring.kind, *cells), []).append(spring)
         for (kind, *cells), same in groups.items():
             yield (f"{kind} {name_pairs(same)}", *cells)
-
-    def _cells(self, spring: Spring) -> tuple[str, ...]:
-        cells = (
-            *map(format_number, (spring.stiffness, spring.damping, np.sqrt(max(spring.stiffness, 0.0)))),
-            *map(format_number, (spring.damping_ratio, 1e3 * spring.time_constant)),
-            format_number(1e3 * spring.given) if spring.is_hidden and spring.given is not None else "",
-            format_range(spring.impedance),
-            *map(format_number, (spring.load, spring.coupled_load, spring.num_steps)),
-        )
-        if self.speed is None:
-            return cells
-        if spring.speed is None:
-            return (*cells, "", "")
-        depth = f"{format_number(1e3 * spring.depth(spring.speed))} mm"
-        return (*cells, depth, format_number(spring.rise_steps(spring.speed)))
 
 
 def _warnings_at_rest(spring: Spring) -> Iterator[str]:
@@ -224,8 +209,8 @@ def _warnings_at_rest(spring: Spring) -> Iterator[str]:
     step = spring.timestep
     softness, direct = "Softness, which writes the format", "the direct format, a negative solref,"
     remedy = f"{softness if spring.kind == 'contact' else direct} which refsafe leaves alone"
-    hidden = altered_by_refsafe(spring.given or 0.0, spring.damping, step, remedy)
-    yield from filter(None, (hidden, beyond_stability(*spring.steepest, step, spring.integrator)))
+    altered = altered_by_refsafe(spring.replaced or 0.0, spring.damping, step, remedy)
+    yield from filter(None, (altered, beyond_stability(*spring.steepest, step, spring.integrator)))
     if spring.load < 1 <= spring.coupled_load:
         yield (
             f"stable alone, at {spring.load:.2g} of the largest time step, but not where {spring.num_rows} contacts act at "
@@ -335,6 +320,8 @@ def _others(scene: Scene) -> Iterator[Spring]:
 def _spring(
     scene: Scene, kind: str, name: str, stiffness: float, damping: float, solref, impedance, width, **rest: Any
 ) -> Spring:
+    # With a relative margin, because float32 rounds a time constant of exactly two steps.
+    is_replaced = solref[0] > 0 and damping * solref[0] * (1 + 1e-5) < 2
     return Spring(
         kind=kind,
         name=name,
@@ -342,7 +329,7 @@ def _spring(
         damping=float(damping),
         impedance=(float(impedance[0]), float(impedance[1])),
         width=max(float(width), mujoco.mjMINVAL),
-        given=float(solref[0]) if solref[0] > 0 else None,
+        replaced=float(solref[0]) if is_replaced else None,
         timestep=float(scene.model.opt.timestep),
         integrator=mujoco.mjtIntegrator(int(scene.model.opt.integrator)),
         **rest,

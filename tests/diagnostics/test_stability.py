@@ -96,10 +96,10 @@ def test_a_bounce_lasts_and_goes_as_deep_as_the_closed_form_says():
 def test_what_refsafe_replaces_is_said_with_the_time_constant_in_effect():
     report = _report(refsafe="enable", solref=".003 1")
     (spring,) = report.springs
-    assert spring.is_hidden
+    assert spring.replaced == pytest.approx(0.003)
     assert spring.time_constant == pytest.approx(0.004)
     assert any("refsafe replaces it by 0.004 s" in text for text in report.warnings)
-    assert not _report(refsafe="enable", solref="-1e4 -200").springs[0].is_hidden
+    assert _report(refsafe="enable", solref="-1e4 -200").springs[0].replaced is None
 
 
 def test_joint_limits_are_looked_at_with_their_own_format_and_remedy():
