@@ -79,27 +79,17 @@ class Evidence(eqx.Module):
 
 
 class Memory(eqx.Module):
-    r"""Evidence on the bias from all estimates of a descent: the mean difference of both parts, older ones counting less.
+    """Evidence on the bias from all estimates of a descent: the mean difference of both parts, older ones counting less."""
 
-    Attributes:
-        difference: mean difference between both parts.
-        noise: its noise, the trace of its covariance matrix.
-        noise_square: the norm of its covariance matrix, $\sqrt{\mathrm{tr}\,\Sigma^2}$; a sum of those of the estimates,
-            which is no less.
-        bound: mean bound on the squared bias.
-        zeroth_width: mean root of the noise of zeroth order. A step's own would give zeroth order less weight just where a
-            rare sample shows what derivatives miss.
-        weight: sum of the weights, 1 for the last estimate.
-        concentration: sum of their squares where they sum to one.
-    """
-
-    difference: Vector
-    noise: Scalar
-    noise_square: Scalar
-    bound: Scalar
+    difference: Vector  # mean difference between both parts
+    noise: Scalar  # its noise, the trace of its covariance matrix Σ
+    noise_square: Scalar  # the norm of Σ, √tr Σ², at most: the sum of those of the estimates
+    bound: Scalar  # mean bound on the squared bias
+    # Mean root of the noise of zeroth order. A step's own would give zeroth order less weight just where a rare sample shows
+    # what derivatives miss.
     zeroth_width: Scalar
-    weight: Scalar
-    concentration: Scalar
+    weight: Scalar  # sum of the weights, 1 for the last estimate
+    concentration: Scalar  # sum of their squares where they sum to one
 
     @classmethod
     def of(cls, difference: Vector, evidence: Evidence) -> "Memory":

@@ -6,10 +6,11 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import one_of
 from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, assemble
 from mjxgrad.estimators.moments import Moments, ScoreMoments, as_real
-from mjxgrad.estimators.samples import Plan, Samples, all_finite, check_baseline, stream
+from mjxgrad.estimators.samples import Plan, Samples, all_finite, stream
 from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Vector
 
@@ -80,7 +81,7 @@ def zeroth_order(
         REINFORCE samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
     objective, vector, restore = as_vector(objective, params)
-    check_baseline(baseline)
+    one_of("baseline", baseline, ("leave_one_out", "zero_noise", "none"))
     is_needed, has_own = baseline == "zero_noise", objective.has_circumstances
     plan = Plan(
         num_samples,

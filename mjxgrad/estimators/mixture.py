@@ -14,7 +14,7 @@ from mjxgrad.estimators.evidence import Evidence, Memory, noise_dim
 from mjxgrad.estimators.moments import Moments, as_real
 from mjxgrad.estimators.rules import FixedAlpha, LeastRisk, Rule, Weights
 from mjxgrad.estimators.samples import Group, Plan, Samples, in_groups, plan_by_noise, stream
-from mjxgrad.estimators.unbiased import Products, SecantSums, UnbiasedTerms, gram, secant_sums, unbiased_terms
+from mjxgrad.estimators.unbiased import Products, SecantSums, gram, secant_sums, unbiased_terms
 from mjxgrad.objective import Objective, as_vector
 from mjxgrad.objective.base import Scalar, Vector
 
@@ -175,13 +175,13 @@ def both_parts(samples: Samples, *, control_variate: bool) -> Parts:
     chunk = Group.of(samples)
     groups = chunk.split()
 
-    def compare(group: Group) -> tuple[UnbiasedTerms, SecantSums]:
+    def compare(group: Group) -> tuple[Array, Array, SecantSums]:
         slopes = gram(group)
-        return unbiased_terms(group, slopes, with_derivatives=control_variate), secant_sums(group, slopes)
+        return *unbiased_terms(group, slopes, with_derivatives=control_variate), secant_sums(group, slopes)
 
-    terms, secants = jax.vmap(compare)(groups)
+    terms, beta, secants = jax.vmap(compare)(groups)
     count = len(chunk.costs)
-    terms_by_noise = terms.by_noise.reshape(-1, terms.by_noise.shape[-1])[:count]
+    terms_by_noise = terms.reshape(-1, terms.shape[-1])[:count]
     # A group with a single cost has no baseline.
     num_costs = groups.has_cost.sum(axis=1)
     has_cost = chunk.complete((groups.has_cost & (num_costs >= 2)[:, None]).ravel()[:count])
@@ -204,7 +204,7 @@ def both_parts(samples: Samples, *, control_variate: bool) -> Parts:
         differences=products(unbiased - first, has_both, size // chunk.per_unit),
         scores=products(pulled[2], chunk.has_cost, size),
         score_variance=(pulled[2] ** 2).sum(),
-        beta=(groups.has_cost * terms.beta).sum(),
+        beta=(groups.has_cost * beta).sum(),
         num_costs=real_counts.sum(),
         num_groups=as_real((num_costs >= 2).sum(), chunk.costs),
         num_felt=samples.num_felt(),

@@ -2,12 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import PRNGKeyArray, PyTree
 
+from mjxgrad._arrays import one_of
 from mjxgrad._programs import compiled
 from mjxgrad.estimators.estimate import GradientEstimate, Reason, assemble
 from mjxgrad.estimators.moments import Moments, as_real
-from mjxgrad.estimators.samples import Group, Plan, check_baseline, plan_by_noise, sample
+from mjxgrad.estimators.samples import Group, Plan, plan_by_noise, sample
 from mjxgrad.estimators.unbiased import gram, unbiased_terms
 from mjxgrad.objective import ActionNoise, Objective, as_vector
 
@@ -58,7 +59,12 @@ def reinforce(
         REINFORCE samples, get a baseline for free! ICLR 2019 workshop, equation 8 (leave-one-out).
     """
     objective, vector, restore = as_vector(objective, params)
-    objective = _checked(objective, baseline)
+    if not isinstance(objective, ActionNoise):
+        raise ValueError(
+            f"objective must have noise on actions, from open_loop or closed_loop, got {type(objective).__name__}; "
+            "use zeroth_order where there are no steps"
+        )
+    one_of("baseline", baseline, ("leave_one_out", "none"))
     plan = Plan(num_samples, with_score=True)
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_samples))
     noises = jax.vmap(objective.sample_noise)(keys)
@@ -68,7 +74,8 @@ def reinforce(
             f"reinforce must be given a task with step_costs, got {type(objective.task).__name__}, which knows only "
             "the total; use zeroth_order, or let its cost be one number per step"
         )
-    to_go = _costs_to_go(outcomes.step_costs, objective.task.horizon)
+    # Costs after the last action are in all of them.
+    to_go = jnp.cumsum(outcomes.step_costs[:, ::-1], axis=1)[:, ::-1][:, : objective.task.horizon]
     actions = jax.vmap(lambda noise: objective.split(noise)[0])(noises)
     is_used = jnp.isfinite(outcomes.cost) & jnp.isfinite(to_go).all(axis=1)
     count = is_used.sum()
@@ -94,21 +101,6 @@ def reinforce(
     )
 
 
-def _costs_to_go(step_costs: Float[Array, "num_samples steps"], horizon: int) -> Float[Array, "num_samples horizon"]:
-    """Return the sum of the costs from each step on; costs after the last action are in all of them."""
-    return jnp.cumsum(step_costs[:, ::-1], axis=1)[:, ::-1][:, :horizon]
-
-
-def _checked(objective: Objective, baseline: str) -> ActionNoise:
-    if not isinstance(objective, ActionNoise):
-        raise ValueError(
-            f"objective must have noise on actions, from open_loop or closed_loop, got {type(objective).__name__}; "
-            "use zeroth_order where there are no steps"
-        )
-    check_baseline(baseline, ("leave_one_out", "none"))
-    return objective
-
-
 @compiled
 def per_step_inverse_variance(
     objective: Objective, params: PyTree, key: PRNGKeyArray, *, num_samples: int
@@ -130,8 +122,8 @@ def per_step_inverse_variance(
     plan = plan_by_noise(objective, num_samples, None)
     samples = sample(objective, vector, key, plan, jnp.arange(plan.num_units))
     chunk = Group.of(samples)
-    terms = jax.vmap(lambda group: unbiased_terms(group, gram(group), with_derivatives=False))(chunk.split())
-    zeroth = terms.by_noise.reshape(-1, terms.by_noise.shape[-1])[: len(chunk.costs)]
+    terms, _ = jax.vmap(lambda group: unbiased_terms(group, gram(group), with_derivatives=False))(chunk.split())
+    zeroth = terms.reshape(-1, terms.shape[-1])[: len(chunk.costs)]
     is_used = chunk.complete(chunk.has_derivative)
     variances = [Moments.of(chunk.by_unit(x), is_used).variance() for x in (chunk.derivatives, zeroth)]
     total = variances[0] + variances[1]

@@ -76,12 +76,6 @@ class Plan:
         return num_chunks, -(-units // num_chunks)
 
 
-def check_baseline(baseline: str, choices: tuple[str, ...] = ("leave_one_out", "zero_noise", "none")) -> None:
-    """Raise a ValueError for an unknown baseline."""
-    if baseline not in choices:
-        raise ValueError(f"baseline must be one of {', '.join(map(repr, choices))}, got {baseline!r}")
-
-
 def plan_by_noise(objective: Objective, num_samples: int, chunk_size: int | None) -> Plan:
     """Return a plan of rollouts differentiated by their noise; with random starts, in pairs that share a start."""
     if chunk_size is not None and chunk_size < 4:

@@ -22,22 +22,18 @@ _Pairs = Float[Array, "samples samples"]
 _ROUNDING = 32.0
 
 
-class UnbiasedTerms(eqx.Module):
-    """The terms of a group, whose mean after the pull-back is the estimate."""
-
-    by_noise: Float[Array, "samples m"]  # term of each sample before the pull-back
-    beta: Float[Array, " samples"]  # share β of each sample
-
-
 def gram(samples: Group) -> _Pairs:
     """Return the slope of sample i along the noise of sample k, from which all comparisons follow."""
     return jnp.matmul(samples.derivatives, samples.noise.T, precision=jax.lax.Precision.HIGHEST)
 
 
-def unbiased_terms(samples: Group, slopes: _Pairs, *, with_derivatives: bool) -> UnbiasedTerms:
-    """Return the terms of a group; without derivatives, the terms of the zeroth-order estimate.
+def unbiased_terms(
+    samples: Group, slopes: _Pairs, *, with_derivatives: bool
+) -> tuple[Float[Array, "samples m"], Float[Array, " samples"]]:
+    """Return the terms of a group, and the share β of each; without derivatives, the terms of the zeroth-order estimate.
 
-    Terms of samples without a cost are meaningless; the pull-back masks them.
+    The mean of the terms after the pull-back is the estimate. Terms of samples without a cost are meaningless; the pull-back
+    masks them.
     """
     costs, has_cost = samples.costs, samples.has_cost.astype(samples.costs.dtype)
     has_slope = samples.has_derivative.astype(costs.dtype)
@@ -55,8 +51,7 @@ def unbiased_terms(samples: Group, slopes: _Pairs, *, with_derivatives: bool) ->
     residual = jnp.diagonal(rest) - baseline
     total = samples.derivatives.sum(axis=0)[None, :]
     without = (total - samples.derivatives) / jnp.maximum(num_slopes - has_slope, 1)[:, None]
-    by_noise = residual[:, None] * samples.scores + beta[:, None] * without
-    return UnbiasedTerms(by_noise, beta)
+    return residual[:, None] * samples.scores + beta[:, None] * without, beta
 
 
 def _fitted_share(samples: Group, slopes: _Pairs, others: _Pairs) -> Float[Array, " samples"]:
