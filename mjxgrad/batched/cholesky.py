@@ -1,9 +1,7 @@
 """Batched Cholesky solves with symmetric matrices of joint-space size.
 
 Arrays may carry the batch as trailing axis, see `linear`. A CPU runs the factorisation column by column, each operation along
-the batch. It is written out, or, where that would take long to compile, runs block by block. A GPU has one kernel for it.
-
-A CPU does not use LAPACK for batches: it takes one matrix after the other. With jaxlib before 0.11 its threads may deadlock.
+the batch: written out, or, where that would take long to compile, block by block. LAPACK would take one matrix after the other.
 """
 
 from typing import Any

@@ -1,11 +1,8 @@
 """The device that a program is for, and batches split over several devices. No other module asks for the device.
 
 A CPU runs operations along the batch and handles loops well; a GPU spends a microsecond on starting any operation. So several
-parts of the library have two implementations and choose one here.
-
-XLA runs one small operation after another, and the second core of a CPU idles most of that time. As two devices
-(`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used, or `XLA_FLAGS=--xla_force_host_platform_device_count=2`)
-the cores work in parallel by `over_devices`, and so do several GPUs.
+parts of the library have two implementations and choose one here. XLA leaves the second core of a CPU idle most of the time: as
+two devices (`jax.config.update("jax_num_cpu_devices", 2)` before JAX is used) the cores work in parallel by `over_devices`.
 """
 
 import functools

@@ -1,10 +1,8 @@
 """GPU kernels: a program solves one state and stops when that state is done.
 
-As operations on batched arrays, Newton's method runs until the last state is done: on an ant 5.7 iterations, where the mean is
-1.5. Each iteration starts some thirty kernels. Here every state has a program that keeps J and H in registers. The kernels
-are Triton's, by `jax.experimental.pallas`; they are short, since they operate on whole matrices.
-
-Arrays have the batch as trailing axis outside the kernels, see `linear`. `interpret` runs a kernel on any device, slowly.
+As operations on batched arrays, Newton's method runs until the last state is done, and each iteration starts some thirty kernels.
+Here every state has a program that keeps J and H in registers. The kernels are Triton's, by `jax.experimental.pallas`. Arrays
+have the batch as trailing axis outside the kernels, see `linear`. `interpret` runs a kernel on any device, slowly.
 """
 
 import functools

@@ -1,9 +1,8 @@
 """Contacts between geoms: MJX's pairs and slots, and some of its functions.
 
 Contacts of planes, balls and capsules are in `capsules`, those of two boxes in `boxes`, and of boxes and cylinders with planes,
-balls and capsules in `solids`. Where two faces touch, one of them of a mesh, MJX's contacts lie on the clipping face; C MuJoCo's
-and ours lie half way between both faces. For a mesh that lies flat up to rounding, MJX takes two edges as touching, and returns
-one contact at their far ends. All other kinds of pair are MJX's.
+balls and capsules in `solids`. All other kinds of pair are MJX's, with two changes for meshes. Contacts of two faces lie half way
+between both, as in C MuJoCo, and edges of a mesh that lies flat up to rounding are not taken as touching.
 """
 
 import sys

@@ -1,9 +1,8 @@
 r"""The constraint Jacobian as a linear map, applied without being formed.
 
-A derivative of the solve needs only products of J and a vector, and their reverse mode is as cheap as the products. A
-contact's rows are the relative velocity of two bodies at a point: six numbers per body, whatever the number of joints. The
-solve needs the entries, see `hessian`. A map returns them group by group, and a pyramid's edges n ± μ t as its directions n, t.
-They may have the batch as trailing axes, see `linear`; a map is applied to one state.
+A derivative of the solve needs only products of J and a vector. A contact's rows are the relative velocity of two bodies at a
+point: six numbers per body, whatever the number of joints. The solve needs the entries, see `hessian`: group by group, of a
+pyramid's edges n ± μ t as its directions n, t. They may have the batch as trailing axes; a map is applied to one state.
 """
 
 import abc

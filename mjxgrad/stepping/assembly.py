@@ -1,9 +1,8 @@
 r"""All constraint rows of a state: Jacobian, reference acceleration and weight.
 
-The rows and their order are those of `mjx.make_constraint`, so that `mjx.Data` keeps its meaning. They are formed differently
-for two reasons. Derivatives: MJX's impedance has NaN derivatives beyond its width, its stiffness for a direct solref without
-damping, and its norms have none near zero. Speed: the Jacobian is a map that is applied without being formed (see `jacobian`),
-and the impedance is evaluated once per contact, not once per pyramid edge.
+The rows and their order are those of `mjx.make_constraint`, so that `mjx.Data` keeps its meaning. MJX's impedance has NaN
+derivatives beyond its width, its stiffness for a direct solref without damping, and its norms have none near zero. Here the
+Jacobian is a map that is applied without being formed, and the impedance is evaluated once per contact.
 
 References:
     MuJoCo documentation, "Modeling", "Solver parameters"; "Computation", "Constraint model".

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, get_args
 import equinox as eqx
 import jax
 
+from mjxgrad._arrays import one_of
 from mjxgrad.stepping.onset import Onset
 from mjxgrad.stepping.smoothing import Smoothing
 
@@ -71,8 +72,7 @@ def own_motion(gradient: str) -> Discrete | Slope:
     Raises:
         ValueError: if there is no such derivative.
     """
-    if gradient not in get_args(Gradient):
-        raise ValueError(f"gradient must be one of {', '.join(map(repr, get_args(Gradient)))}, got {gradient!r}")
+    one_of("gradient", gradient, get_args(Gradient))
     return Slope() if gradient == "slope" else Discrete()
 
 

@@ -66,7 +66,6 @@ def _block(
 
 
 def _ends(model: mjx.Model, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return whether constraints are between sites, their two objects each, and the objects' bodies."""
     is_site = np.asarray(model.eq_objtype)[ids] == mujoco.mjtObj.mjOBJ_SITE
     objects = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
     bodies = objects.copy()
@@ -76,7 +75,6 @@ def _ends(model: mjx.Model, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
 
 
 def _points(model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: _Ends) -> _Ends:
-    """Return the world positions of both ends: sites, or anchors in the frames of their bodies."""
     is_site, objects, bodies = _ends(model, ids)
     points = data.xpos[bodies] + jnp.sum(data.xmat[bodies] * anchors[:, :, None, :], axis=-1)
     if is_site.any():
@@ -88,7 +86,6 @@ def _points(model: mjx.Model, data: mjx.Data, ids: np.ndarray, anchors: _Ends) -
 def _translation(
     model: mjx.Model, data: mjx.Data, points: _Ends, bodies: np.ndarray
 ) -> Float[Array, "constraints 3 nv"]:
-    """Return the Jacobian of the first end's position less the second's."""
     frame = jnp.broadcast_to(jnp.eye(3, dtype=points.dtype), (len(points), 3, 3))
     world = np.zeros_like(bodies[:, 0])
     first, second = (

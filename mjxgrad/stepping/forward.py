@@ -1,10 +1,8 @@
 """Accelerations and time integration: MJX's stages in order, with our own rows, solve and integration.
 
-Stages without work (no actuators, tendons, sensors or rows) are skipped when the program is traced. `jax.jit` removes unused
-results: camera poses, the unconstrained acceleration, the factor of the mass matrix. Therefore the solve starts from the last
-acceleration alone. MJX also evaluates the unconstrained one, which takes another factorisation.
-
-Matrix products request full precision: NVIDIA GPUs otherwise round factors to ten bits, contact Jacobians included.
+Stages without work (no actuators, tendons, sensors or rows) are skipped when the program is traced, and `jax.jit` removes unused
+results. So the solve starts from the last acceleration alone: MJX also evaluates the unconstrained one, which takes another
+factorisation. Matrix products request full precision: NVIDIA GPUs otherwise round factors to ten bits.
 """
 
 import contextlib
@@ -57,8 +55,9 @@ def at_full_precision(model: mjx.Model, data: mjx.Data) -> Iterator[None]:
 def advance(model: mjx.Model, data: mjx.Data, contact: Contact) -> mjx.Data:
     """Return data one step later, by any way of contact but `Slope`; see `stepping.step`."""
     if model.opt.integrator == _Integrator.mjINT_RK4:
-        return _after_stages(model, data, _stages(model, data, contact))
-    return _after_one(model, _forward(model, data, contact))
+        return _after_stages(model, data, contact)
+    data, is_euler = _forward(model, data, contact), model.opt.integrator == _Integrator.mjINT_EULER
+    return _advance(model, data, (_euler_acceleration if is_euler else _implicit_acceleration)(model, data), None)
 
 
 def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> mjx.Data:
@@ -173,18 +172,8 @@ def smooth(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Data, list[Block]]:
     return forces.fwd_acceleration(model, forces.fwd_actuation(model, data)), blocks
 
 
-def _after_one(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Return data one step later, from the accelerations of `_forward`."""
-    is_euler = model.opt.integrator == _Integrator.mjINT_EULER
-    return _advance(model, data, (_euler_acceleration if is_euler else _implicit_acceleration)(model, data), None)
-
-
 def _euler_acceleration(model: mjx.Model, data: mjx.Data) -> _Vector:
-    """Return the acceleration with joint damping taken implicitly, unless eulerdamp is off.
-
-    With M a the sum of all forces, (M + h D) a' = M a gives a' = a - (M + h D)⁻¹ h D a. So neither the forces nor their
-    derivatives need to be summed.
-    """
+    """Return the acceleration with joint damping taken implicitly: (M + h D) a' = M a gives a' = a - (M + h D)⁻¹ h D a."""
     is_off = model.opt.disableflags & (_Disable.mjDSBL_EULERDAMP | _Disable.mjDSBL_DAMPER)
     if is_off or is_known_to_be(0.0, model.dof_damping):
         return data.qacc
@@ -212,11 +201,8 @@ def _advance(model: mjx.Model, data: mjx.Data, acceleration: _Vector, velocity: 
     return moved.replace(qpos=qpos, qvel=qvel, qacc_warmstart=data.qacc)
 
 
-def _stages(model: mjx.Model, start: mjx.Data, contact: Contact) -> tuple[tuple[Array, ...], mjx.Data]:
-    """Return the mean rates of position, velocity and activations by the classical fourth-order rule, and its four stages.
-
-    All four stages are turns of one scan, the first included, so that the forward pass is compiled once.
-    """
+def _after_stages(model: mjx.Model, start: mjx.Data, contact: Contact) -> mjx.Data:
+    """Return data one step later by the classical fourth-order rule, whose stages are turns of one scan, compiled once."""
     h = model.opt.timestep
     rest = tuple(jnp.zeros_like(x) for x in (start.qvel, start.qvel, start.act))
 
@@ -237,13 +223,7 @@ def _stages(model: mjx.Model, start: mjx.Data, contact: Contact) -> tuple[tuple[
 
     tableau = (jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6)
     tableau = jax.tree.map(lambda x: x.astype(start.qvel.dtype), tableau)
-    (_, means, _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
-    return means, stages
-
-
-def _after_stages(model: mjx.Model, start: mjx.Data, found: tuple[tuple[Array, ...], mjx.Data]) -> mjx.Data:
-    """Return data one step later, from the result of `_stages`."""
-    (velocity, acceleration, act_dot), stages = found
+    (_, (velocity, acceleration, act_dot), _), stages = jax.lax.scan(stage, (rest, rest, start.qacc_warmstart), tableau)
     last = jax.tree.map(lambda x: x[-1], stages).replace(
         qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time, act_dot=act_dot
     )

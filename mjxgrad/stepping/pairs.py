@@ -1,12 +1,9 @@
 r"""The slope of an outcome by MJX: motions from either side of each event, followed beside the motion itself.
 
-The rule is that of `engines.events` and `engines.flight`, which say why: a change of the start moves the crossing of a surface to
-another step. Two motions that lie a step's travel apart tell what that does, until the derivative along the motion explains how
-they differ. Here each motion has a few slots for such pairs, and everything has a fixed size, so that a GPU takes thousands of
-motions at a time.
-
-For each pair, D is the difference of its two motions over how far apart they began, and h what its event has felt of a change.
-The change of a state is that along the motion, x, and of all pairs together:
+The rule is that of `engines.events` and `engines.flight`, which say why. Here each motion has a few slots for pairs, and
+everything has a fixed size, so that a GPU takes thousands of motions at a time. For each pair, D is the difference of its two
+motions over how far apart they began, and h what its event has felt of a change. The change of a state is that along the motion,
+x, and of all pairs together:
 
     whole = x + Σ D h,    x' = A (1 - P L) x + B u,    h' = h, or L x where a pair begins,    x += D h where one is let go.
 
@@ -20,7 +17,6 @@ the rule; the motions of pairs are stepped, not differentiated. Where nothing is
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -54,11 +50,11 @@ _MOST_HELD, _NUM_HOLDS = 8, 3  # rows, and how often those are sought that a dis
 _LOOSE = 1e-3  # of the inverse inertia of rows that are held: they may depend on each other
 # Small differences: of the farthest points (m, m/s). In single precision rounding is 0.4 % of them.
 _SMALL, _SMALL_IN_SINGLE = (1e-7, 1e-5), (3e-5, 1e-3)
-# Inputs that move nothing within a step.
-_FORCES = ("ctrl", "qfrc_applied", "xfrc_applied", "time", "qacc_warmstart")
+_FORCES = ("ctrl", "qfrc_applied", "xfrc_applied", "time", "qacc_warmstart")  # inputs that move nothing within a step
 
 _Vector = Float[Array, " nv"]
 _Change = Float[Array, " size"]
+_Given = tuple[mjx.Model, mjx.Data]  # with None in place of leaves that are known
 
 
 class Motion(NamedTuple):
@@ -70,25 +66,15 @@ class Motion(NamedTuple):
 
 
 class Flight(eqx.Module):
-    """Pairs of motions in flight beside a motion.
+    """Pairs of motions in flight beside a motion."""
 
-    Attributes:
-        ends: both motions of each, with axes of slots and sides.
-        widths: how far apart they began (m or rad); 0 in a free slot.
-        left: for how many steps they may go on.
-        alike: for how many steps the derivative along the motion has explained them.
-        apart: D, in tangent space.
-        held: h; zeros whose derivative it is.
-        lengths: how far each velocity moves the farthest point below it, at the reference pose (m or 1).
-    """
-
-    ends: Motion
-    widths: Float[Array, " slots"]
-    left: Int[Array, " slots"]
-    alike: Int[Array, " slots"]
-    apart: Float[Array, "slots size"]
-    held: Float[Array, " slots"]
-    lengths: Float[Array, " nv"]
+    ends: Motion  # both motions of each, with axes of slots and sides
+    widths: Float[Array, " slots"]  # how far apart they began (m or rad); 0 in a free slot
+    left: Int[Array, " slots"]  # for how many steps they may go on
+    alike: Int[Array, " slots"]  # for how many steps the derivative along the motion has explained them
+    apart: Float[Array, "slots size"]  # D, in tangent space
+    held: Float[Array, " slots"]  # h; zeros whose derivative it is
+    lengths: Float[Array, " nv"]  # how far each velocity moves the farthest point below it, at first (m or 1)
 
 
 def no_flight(model: mjx.Model, data: mjx.Data) -> Flight:
@@ -125,56 +111,41 @@ def put(data: mjx.Data, motion: Motion) -> mjx.Data:
 
 
 def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, Flight]:
-    """Take a motion, and what is in flight beside it, through a step of MuJoCo.
-
-    Returns:
-        Data after the step, whose derivative is along the motion alone; `whole` adds the rest.
-    """
+    """Take a motion, and what is in flight beside it, through a step; its derivative is then that along the motion alone."""
     program = _Program(model, data)
 
     @jax.custom_jvp
-    def run(flight: Flight, *given: Array) -> tuple[mjx.Data, Flight]:
-        return _as_batched(program.motion(given).qpos, (program.step(*given), flight))
+    def run(flight: Flight, given: _Given) -> tuple[mjx.Data, Flight]:
+        return _as_batched(given[1].qpos, (program.step(given), flight))
 
     def differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
         with at_full_precision(model, data):
-            found, rates = _Step(program, primals[0], primals[1:]).differentiate(tangents[0], tangents[1:])
-        return tuple(_as_batched(program.motion(primals[1:]).qpos, x) for x in (found, rates))
+            found, rates = _Step(program, *primals).differentiate(*tangents)
+        return tuple(_as_batched(primals[1][1].qpos, x) for x in (found, rates))
 
     run.defjvp(differentiated, symbolic_zeros=True)
     with at_full_precision(model, data):
-        moved, after = run(flight, *program.given)
+        moved, after = run(flight, program.given)
     return moved, eqx.tree_at(lambda x: x.held, jax.lax.stop_gradient(after), after.held)
 
 
 class _Program:
-    """The step and the rows of a model and its data, as functions of the leaves that only the running program knows.
+    """The step and the rows of a model and its data, as functions of the leaves that only the running program knows."""
 
-    Known leaves stay known, so that a step leaves out what a scene does not need. Functions are traced once for all uses.
-    """
+    # Known leaves stay known, so that a step leaves out what a scene does not need. Functions are traced once for all uses.
 
     def __init__(self, model: mjx.Model, data: mjx.Data):
-        self.model = model
-        self.leaves, self.form = jax.tree.flatten((model, data))
-        numbers = jax.tree.unflatten(self.form, range(len(self.leaves)))[1]
-        moving, forces = (numbers.qpos, numbers.qvel, numbers.act), {getattr(numbers, name) for name in _FORCES}
-        self.unknown = [i for i, x in enumerate(self.leaves) if i in moving or isinstance(x, jax.core.Tracer)]
-        self.given = [self.leaves[i] for i in self.unknown]
-        self.places = tuple(self.unknown.index(i) for i in moving)
-        self.moves_gaps = [i not in moving and i not in forces for i in self.unknown]
-        self.step = jax.jit(lambda *given: advance(*self.all_of(given), Discrete()))
-        self.rows = jax.jit(lambda *given: rows_of(*_smoothed(*self.all_of(given))))
+        is_unknown = jax.tree.map(lambda x: isinstance(x, jax.core.Tracer), (model, data))
+        self.given, self.known = eqx.partition((model, data), _put_in(is_unknown, Motion(True, True, True)))
+        self.step = jax.jit(lambda given: advance(*self.all_of(given), Discrete()))
+        self.rows = jax.jit(lambda given: rows_of(*_smoothed(*self.all_of(given))))
 
-    def all_of(self, given: Sequence[Any]) -> tuple[mjx.Model, mjx.Data]:
-        """Return model and data with these leaves."""
-        return jax.tree.unflatten(self.form, _with(self.leaves, self.unknown, given))
+    def all_of(self, given: _Given) -> _Given:
+        return eqx.combine(given, self.known)
 
-    def motion(self, given: Sequence[Any]) -> Motion:
-        return Motion(*(given[k] for k in self.places))
 
-    def put(self, given: Sequence[Any], motion: Motion) -> list[Any]:
-        """Return leaves with another motion."""
-        return _with(given, self.places, motion)
+def _put_in(given: _Given, motion: Motion) -> _Given:
+    return given[0], put(given[1], motion)
 
 
 class _Near(NamedTuple):
@@ -212,55 +183,50 @@ class _Plan(NamedTuple):
 class _Step:
     """One step of a motion and of its pairs. All but the derivative along the motion is a constant to further derivatives."""
 
-    def __init__(self, program: _Program, flight: Flight, given: Sequence[Array]):
-        self.program, self.given = program, list(given)
-        self.flight, self.still = jax.lax.stop_gradient((flight, self.given))
-        self.model, self.now = program.all_of(self.still)[0], program.motion(self.still)
+    def __init__(self, program: _Program, flight: Flight, given: _Given):
+        self.program, self.given = program, given
+        self.flight, self.still = jax.lax.stop_gradient((flight, given))
+        self.model, self.now = program.all_of(self.still)[0], taken(self.still[1])
         self.nv, self.size, self.dtype = self.model.nv, flight.apart.shape[1], self.now.qvel.dtype
         self.has_stages = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
-    def differentiate(self, given_flight: Flight, tangents: Sequence[Any]) -> tuple[Any, Any]:
+    def differentiate(self, given_flight: Flight, tangents: _Given) -> tuple[Any, Any]:
         """Return data and flight after the step, and the tangents of both."""
-        program, flight = self.program, self.flight
+        program, flight, now = self.program, self.flight, taken(self.given[1])
         # Leaves, beside the motion, that have a tangent.
-        others = [k for k, x in enumerate(tangents) if k not in program.places and not isinstance(x, SymbolicZero)]
-        values, rates = [self.given[k] for k in others], [tangents[k] for k in others]
-        now = program.motion(self.given)
+        others = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
+        others = _put_in(others, Motion(False, False, False))
+        (values, fixed), rates = eqx.partition(self.given, others), eqx.filter(tangents, others)
 
-        def moved_by(change: _Change, *values: Array) -> tuple[mjx.Data, mjx.Data]:
-            given = program.put(
-                _with(self.given, others, values), _with_change(program.all_of(self.given)[0], now, change)
-            )
-            return eqx.partition(program.step(*given), eqx.is_inexact_array)
+        def moved_by(change: _Change, values: _Given) -> tuple[mjx.Data, mjx.Data]:
+            motion = _with_change(program.all_of(self.given)[0], now, change)
+            step = program.step(_put_in(eqx.combine(values, fixed), motion))
+            return eqx.partition(step, eqx.is_inexact_array)
 
-        found, along, rest = jax.linearize(moved_by, jnp.zeros(self.size, self.dtype), *values, has_aux=True)
+        found, along, rest = jax.linearize(moved_by, jnp.zeros(self.size, self.dtype), values, has_aux=True)
         moved = eqx.combine(found, rest)
-        change = self._tangent(now.qpos, program.motion(tangents))
+        change = self._tangent(now.qpos, taken(tangents[1]))
         heard = _dense(given_flight.held, flight.held)
         # A step's data belongs to its state; that of several stages to the last of them.
         ends = jax.lax.stop_gradient(moved)
-        rows = program.rows(*self.still) if self.has_stages else rows_of(self.model, put(ends, self.now))
+        rows = program.rows(self.still) if self.has_stages else rows_of(self.model, put(ends, self.now))
         after = flight
         if rows is not None:
             events, plan, after = self._followed(rows, ends)
             # All that follows is linear in tangents.
             change = change + flight.apart.T @ jnp.where(plan.goes_on, 0.0, heard)
             feels = events.rows @ change[: self.nv] + events.ahead @ change[self.nv : 2 * self.nv]
-            if moving := [k for k in others if program.moves_gaps[k]]:
-                feels = feels + events.weights @ self._gap_rates(moving, tangents)[events.chosen]
+            moving = others[0], others[1].replace(**dict.fromkeys(_FORCES, False))
+            if any(jax.tree.leaves(moving)):
+                own, kept = eqx.partition(self.given, moving)
+                gaps = lambda own: program.rows(eqx.combine(own, kept)).gaps  # noqa: E731
+                gap_rates = jax.jvp(gaps, (own,), (eqx.filter(tangents, moving),))[1]
+                feels = feels + events.weights @ gap_rates[events.chosen]
             change = change.at[: self.nv].add(-events.moves @ feels)
             heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels
         still = jax.tree.map(_no_tangent, (moved, after))
-        rates = eqx.combine(along(change, *rates), still[0])
+        rates = eqx.combine(along(change, rates), still[0])
         return (moved, after), (rates, eqx.tree_at(lambda x: x.held, still[1], heard))
-
-    def _gap_rates(self, moving: list[int], tangents: Sequence[Any]) -> Float[Array, " all"]:
-        """Return the tangent of all gaps by leaves beside the motion."""
-
-        def gaps(*values: Array) -> Float[Array, " all"]:
-            return self.program.rows(*_with(self.given, moving, values)).gaps
-
-        return jax.jvp(gaps, [self.given[k] for k in moving], [tangents[k] for k in moving])[1]
 
     def _followed(self, rows: "_Rows", moved: mjx.Data) -> tuple[_Events, _Plan, Flight]:
         """Return the events of the step, who goes on and who begins, and the flight after the step."""
@@ -281,14 +247,12 @@ class _Step:
         return events, plan, Flight(ends, widths, left, alike, apart, flight.held, flight.lengths)
 
     def _tangent(self, qpos: Array, rates: Motion) -> _Change:
-        """Return the tangent of a motion in tangent space."""
         by_position = jnp.zeros(self.nv, self.dtype)
         if not isinstance(rates.qpos, SymbolicZero):
             by_position = jax.jvp(lambda q: position_change(self.model, qpos, q), (qpos,), (rates.qpos,))[1]
         return jnp.concatenate([by_position, _dense(rates.qvel, self.now.qvel), _dense(rates.act, self.now.act)])
 
     def _scaled(self, change: Float[Array, "slots size"]) -> Float[Array, " slots"]:
-        """Return how large changes are (m)."""
         lengths = self.flight.lengths
         by_speed = slope.TRAVEL * self.model.opt.timestep * lengths
         scale = jnp.concatenate([lengths, by_speed, jnp.zeros(self.size - 2 * self.nv, self.dtype)])
@@ -349,16 +313,9 @@ class _Step:
     def _moving(
         self, mode: Array, is_one: Array, scaled: Array, free: Float[Array, " all"], widths: Array, to_middle: Array
     ) -> Float[Array, "nv modes"]:
-        """Return scaled displacements that change one mode alone and, where that can be, carry no free row across zero.
-
-        Args:
-            mode: one row of scaled changes for each.
-            is_one: which are any.
-            scaled: all rows.
-            free: how far from zero those are that take no part in events; infinite of others.
-            widths: one for each mode.
-            to_middle: displacements of all modes from here to the middle of each.
-        """
+        """Return scaled displacements that change one mode alone and, where that can be, carry no free row across zero."""
+        # `free` is how far from zero rows are that take no part in events, infinite of others; `to_middle` has, in
+        # terms of all modes, the displacements to the middle of each.
         sizes = jnp.linalg.norm(scaled, axis=1)
         distance = jnp.where(sizes > 0, free / jnp.where(sizes > 0, sizes, 1.0), jnp.inf)
         nearest, kept = jax.lax.top_k(-distance, min(_MOST_HELD, len(distance)))
@@ -411,17 +368,9 @@ class _Step:
     def _go_on(
         self, events: _Events, plan: _Plan, changes: Float[Array, "slots 2 size"], moved: Motion
     ) -> tuple[Motion, Array, Array, Float[Array, "slots 2 size"]]:
-        """Return both motions of all pairs after the step, how far apart they began, D, and A times changes.
-
-        A is known by small differences of the motion, which are two more motions to step: its linear program would have to be
-        compiled once more.
-
-        Args:
-            events: those of the step.
-            plan: who goes on and who begins.
-            changes: two for each slot, which A multiplies; the second ones matter beside an event alone.
-            moved: the motion after the step.
-        """
+        """Return both motions of all pairs after the step, how far apart they began, D, and A times changes."""
+        # A is known by small differences of the motion, which are two more motions to step: its linear program would
+        # have to be compiled once more. Of changes, two for each slot, the second ones matter beside an event alone.
         flight = self.flight
         shift = events.moves * events.widths
         displaced = jnp.stack([events.middles + shift, events.middles - shift])  # sides nv modes
@@ -436,8 +385,8 @@ class _Step:
         both, is_any = plan.goes_on | plan.begins, jnp.any(events.is_one)
         is_wanted = jnp.stack([both, both, plan.goes_on, plan.goes_on & is_any], axis=1)
 
-        def step(start: Motion, given: list[Array]) -> Motion:
-            return taken(self.program.step(*self.program.put(given, start)))
+        def step(start: Motion, given: _Given) -> Motion:
+            return taken(self.program.step(_put_in(given, start)))
 
         flat = jax.tree.map(lambda x: x.reshape(is_wanted.size, x.shape[-1]), starts)
         found = sparsely(step, is_wanted.ravel(), flat, self.still)
@@ -455,13 +404,11 @@ class _Step:
         return ends, jnp.where(is_sound, widths, 0.0), apart, expected
 
     def _displaced(self, changes: Float[Array, "slots 2 size"]) -> Motion:
-        """Return motions that lie changes away from this one."""
         by_position, by_speed, by_act = jnp.split(changes, [self.nv, 2 * self.nv], axis=-1)
         qpos = jax.vmap(jax.vmap(lambda x: integrate_position(self.model, self.now.qpos, x, 1.0)))(by_position)
         return Motion(qpos, self.now.qvel + by_speed, self.now.act + by_act)
 
     def _small(self, changes: Float[Array, "slots 2 size"]) -> Float[Array, "slots 2 1"]:
-        """Return factors that make changes small."""
         lengths, widths = self.flight.lengths, _SMALL if self.dtype == jnp.float64 else _SMALL_IN_SINGLE
         scale = jnp.concatenate(
             [lengths / widths[0], lengths / widths[1], jnp.full(self.size - 2 * self.nv, 1 / widths[1])]
@@ -474,13 +421,7 @@ class _Step:
         return jnp.concatenate([by_position, one.qvel - other.qvel, one.act - other.act])
 
     def _is_explained(
-        self,
-        events: _Events,
-        plan: _Plan,
-        reach: Array,
-        apart: Array,
-        felt: Array,
-        expected: Float[Array, "slots 2 size"],
+        self, events: _Events, plan: _Plan, reach: Array, apart: Array, felt: Array, expected: Array
     ) -> Bool[Array, " slots"]:
         """Return whether the derivative along the motion says how pairs differ, but for events that lie between the two."""
         plain, rest = expected[:, 0], expected[:, 1]
@@ -491,23 +432,14 @@ class _Step:
 
 
 class _Rows(eqx.Module):
-    """All contacts and limits of a state.
+    """All contacts and limits of a state."""
 
-    Attributes:
-        rows: J of their normals.
-        gaps: distances less margins (m or rad).
-        solimp: their impedances.
-        is_blind: whose distance is known only where they overlap.
-        acceleration: free motion, without contact.
-        is_contact: which are contacts, by themselves.
-    """
-
-    rows: Float[Array, "all nv"]
-    gaps: Float[Array, " all"]
-    solimp: Float[Array, "all 5"]
-    is_blind: Bool[Array, " all"]
-    acceleration: _Vector
-    is_contact: tuple[bool, ...] = eqx.field(static=True)
+    rows: Float[Array, "all nv"]  # J of their normals
+    gaps: Float[Array, " all"]  # distances less margins (m or rad)
+    solimp: Float[Array, "all 5"]  # their impedances
+    is_blind: Bool[Array, " all"]  # whose distance is known only where they overlap
+    acceleration: _Vector  # free motion, without contact
+    is_contact: tuple[bool, ...] = eqx.field(static=True)  # which are contacts, by themselves
 
 
 def _smoothed(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
@@ -567,14 +499,6 @@ def _as_batched(qpos: Array, found: Any) -> Any:
         return jnp.where(is_any, x, x) if x.size else jnp.zeros(x.shape, x.dtype)
 
     return jax.tree.map(batched, found)
-
-
-def _with(given: Sequence[Any], places: Sequence[int], values: Sequence[Any]) -> list[Any]:
-    """Return a list with other values in some places."""
-    changed = list(given)
-    for k, value in zip(places, values, strict=True):
-        changed[k] = value
-    return changed
 
 
 def _dense(tangent: Any, value: Array) -> Array:

@@ -150,7 +150,7 @@ def row_map(model: mjx.Model, data: mjx.Data, contact: Any, first: int, dim: int
     order = order[:, :num_sides]
     sides = tuple(
         tuple((2.0 * k - 1, tuple(np.flatnonzero(own[slot, k]).tolist())) for k in of_slot)
-        for slot, of_slot in enumerate(order)
+        for slot, of_slot in enumerate(order.tolist())
     )
     roots = model.body_rootid[np.take_along_axis(bodies, order, axis=1)]
     centre = maps.pick(roots.reshape(-1), data.subtree_com).reshape(*roots.shape, 3)

@@ -1,29 +1,22 @@
 r"""Contacts averaged over noise on their distance, in closed form, within the solver.
 
 Noise $w$ on the distance $r$ of a contact shifts its rows' reference acceleration, $a_\text{ref} = -B v - K d\,(r + w)$, and
-decides whether there is contact at all, $r + w < 0$. The average is over the step's contact law, not over the motion.
+decides whether there is contact at all, $r + w < 0$. The average is over the step's contact law, not over the motion. As the
+length goes to zero the step tends to MuJoCo's own. (Without the gate, as in barrier methods, damping would brake approaching
+bodies from as far as $2 \zeta |v| / \omega$.)
 
-As the length goes to zero the step tends to MuJoCo's own, gate included. A row without the gate
-would act wherever $J a - a_\text{ref} + K d w < 0$, touching or not, as in interior-point and barrier methods. Its damping
-would brake approaching bodies from as far as $2 \zeta |v| / \omega$: 4 cm at 1 m/s with MuJoCo's default contact.
-
-A row has x = J a + B J v + c r with c = K d(r), and the force -D x where x < 0 and r < 0. Noise w on r turns these into
-x + c w and r + w. With ρ the noise's density and S its softened ramp, in units of its length (see `solver.noise`), the mean
-force is
+A row has x = J a + B J v + c r with c = K d(r), and the force -D x where x < 0 and r < 0. Noise turns these into x + c w and r +
+w. With ρ the noise's density and S its softened ramp, in units of its length (see `solver.noise`), the mean force is
 
     F(x) = -D ∫_{w < W} (x + c w) ρ(w) dw,        W = min(-r, -x/c).
 
-This is D c S(x/c) while x > c r, and its tangent at x = c r below that. Where x - c r is positive, a row releases before the
-bodies separate; where it is negative, a row acts until they do. The cost is a mean of convex functions of a, so the problem
-stays convex, and the same solve finds the acceleration. The rows need two numbers, `constraint.Noise`: spread = c times length,
-and gate = c r. The edges of a pyramid share their noise. For cones see `constraint`.
+This is D c S(x/c) while x > c r, and its tangent at x = c r below that. The cost is a mean of convex functions of a, so the same
+solve finds the acceleration. The rows need two numbers, `constraint.Noise`: spread = c times length, and gate = c r. The edges of
+a pyramid share their noise. For cones see `constraint`.
 
-The weight D and c also depend on depth, through the impedance. They are taken at one depth, the mean of -(r + w) given that it
-is positive: bodies in contact have their depth for short lengths, others the mean penetration when noise makes them touch.
-(At the mean distance itself, contacts whose impedance begins at zero would have no force at a distance.)
-
-MJX knows the distance of boxes, meshes and height fields only where they overlap, and reports 1 or more elsewhere: such
-slots have no rows.
+The weight D and c also depend on depth, through the impedance. They are taken at the mean of -(r + w) given that it is positive.
+MJX knows the distance of boxes, meshes and height fields only where they overlap, and reports 1 or more elsewhere: such slots
+have no rows.
 """
 
 import dataclasses
@@ -36,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import as_float, is_known
+from mjxgrad._arrays import as_float, is_known, one_of
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.collision import CONVEX, are, is_blind
 from mjxgrad.contact.law import impedance, stiffness_damping
@@ -75,8 +68,7 @@ class Smoothing(eqx.Module):
 
     def __check_init__(self):
         for name, choices in (("mode", get_args(Mode)), ("kernel", tuple(KERNELS))):
-            if (given := getattr(self, name)) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {given!r}")
+            one_of(name, getattr(self, name), choices)
         if is_known(self.length) and not np.all((np.asarray(self.length) > 0) & np.isfinite(self.length)):
             remedy = "for MuJoCo's own motion take mg.Discrete()"
             raise ValueError(f"length must be positive and finite, got {np.asarray(self.length)!s}: {remedy}")
@@ -113,10 +105,8 @@ def smoothing_warnings(model: mjx.Model) -> list[str]:
 def smoothed(
     model: mjx.Model, data: mjx.Data, blocks: list[Block], smoothing: Smoothing, layout: RowLayout
 ) -> tuple[list[Block], Noise | None, RowLayout]:
-    """Return rows, the noise of all rows, and their layout under noise; rows with noise are active at any distance.
-
-    For rows without noise its numbers are not used. If no row is smoothed, noise is None and the rest is unchanged.
-    """
+    """Return rows, the noise of all rows, and their layout under noise; rows with noise are active at any distance."""
+    # For rows without noise its numbers are not used. If no row is smoothed, noise is None and the rest is unchanged.
     contact, start = data._impl.contact, 0
     has_distance = jnp.ones(len(contact.dist), bool)
     if np.isin(model.geom_type, CONVEX).any() and len(contact.dist):
