@@ -51,17 +51,17 @@ def parted(tree: Any, *, trusts_hash: bool = False) -> tuple[list[jax.Array], Fo
     leaves, structure = jax.tree.flatten(arrays)
     seen: dict[int, tuple[int, Any]] = {}  # kept with the form, so that its identities stay their own
 
-    def form(leaves: Sequence[Any]) -> Any:
+    def own(leaves: Sequence[Any]) -> Any:
         return eqx.combine(jax.tree.unflatten(structure, leaves), static)
 
     try:
         key = _content(static, seen)
     except _UnknownError:
-        key = (structure, *jax.tree.leaves(static)) if trusts_hash else form
+        key = (structure, *jax.tree.leaves(static)) if trusts_hash else own
     try:
-        form, _ = _FORMS.setdefault(key, (form, seen))
+        form, _ = _FORMS.setdefault(key, (own, seen))
     except TypeError:  # no hash
-        return leaves, form
+        return leaves, own
     if len(_FORMS) > _MOST_KEPT:
         _FORMS.popitem(last=False)
     return leaves, form

@@ -414,7 +414,7 @@ def bias_variance(
         **found,
         softness=stacked,
         params=params,
-        variance_intervals={k: np.moveaxis([ends[k] for _, ends in rows], -1, 0) for k in rows[0][1]},
+        variance_intervals={k: np.moveaxis(np.array([ends[k] for _, ends in rows]), -1, 0) for k in rows[0][1]},
         warnings=told[: len(rows)],
         confidence=confidence,
         share=sum(map(len, done)) / len(jobs),

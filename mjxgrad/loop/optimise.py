@@ -137,7 +137,8 @@ class GradientStep(Descent):
         self, params: Vector, key: PRNGKeyArray, step: Int[Array, ""], memory: PyTree = None
     ) -> tuple[Scalar, GradientEstimate]:
         """Return the scale of a step, 1 without annealing, and the estimate at this scale."""
-        scale, objective = jnp.ones((), params.dtype), self.objective
+        objective: Any = self.objective
+        scale = jnp.ones((), params.dtype)
         if self.annealing is not None:
             scale = jnp.asarray(self.annealing(step), params.dtype)
             objective = objective(scale)
