@@ -17,8 +17,8 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._arrays import whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Exact, Smoother
-from mjxgrad.planning.system import Cost, System, check_problem
-from mjxgrad.planning.trajectory import Course, Problem, checked
+from mjxgrad.planning.system import Cost, System
+from mjxgrad.planning.trajectory import Course, Problem, posed
 from mjxgrad.rollouts import State
 
 PARTS: tuple[str, ...] = ("linear models", "backward pass", "rollouts")
@@ -85,16 +85,12 @@ class Controller(Printed):
         """
         if deadline is not None and not deadline > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
-        check_problem(system, cost)
-        origin, self.num_samples = system.origin, whole("num_samples", num_samples, 0)
-        for message in smoother.warnings(system, origin):
-            warnings.warn(message, stacklevel=2)
-        both = (schedule if first_schedule is None else first_schedule, schedule)
-        given = [checked(system, origin, controls, np.asarray(one), lower, upper) for one in both]
-        self._schedules, self._origin = [np.asarray(factors) for _, factors, *_ in given], np.asarray(origin)
-        start, _, *limits = given[0]
+        self.num_samples = whole("num_samples", num_samples, 0)
+        both = [np.asarray(one) for one in (schedule if first_schedule is None else first_schedule, schedule)]
+        given = system, cost, None, controls, jax.random.key(0), smoother, both, lower, upper
+        problem, start, factors = posed(*given)
+        self._schedules, self._origin = [np.asarray(one) for one in factors], np.asarray(system.origin)
         self.stddev = np.broadcast_to(np.asarray(stddev, self._origin.dtype), (system.num_controls,))
-        problem = Problem(system, cost, smoother, jax.random.split(jax.random.key(0), len(start)), *limits)
         self.system, self.cost, self.deadline = system, cost, deadline
         self._compile(problem, start)
         self._measure()

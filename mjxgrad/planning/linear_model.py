@@ -71,6 +71,10 @@ class Smoother(eqx.Module):
         """Return the smoother with its arrays, which are lengths and standard deviations, multiplied by a factor."""
         return jax.tree.map(lambda length: factor * length, self)
 
+    def steered(self, system: System) -> System | None:
+        """Return the system to be stepped if it takes a whole trajectory in one call; otherwise None."""
+        return None
+
     def warnings(self, system: System, start: StateVector) -> list[str]:
         """Return warnings about unwanted effects of this smoothing at a start; none for traced numbers."""
         return []
@@ -91,24 +95,23 @@ class Analytic(Smoother):
         return self._smoothed(system, "forward").step(state, control)
 
     def linear_model(self, system, state, control, key):
-        end, jacobian = _linearised(system := self._smoothed(system, "backward"), state, control)
+        end, jacobian = (system := self._smoothed(system, "backward")).linearised(state, control)
         exists = jnp.all(jnp.isfinite(jacobian)) & jnp.all(jnp.isfinite(end))
         return LinearModel(*jnp.split(jnp.where(exists, jacobian, jnp.nan), [system.num_changes], axis=1))
 
-    def native(self, system: System) -> SceneSystem | None:
-        """Return the system to be stepped if its engine takes a whole trajectory in one call; otherwise None."""
-        return _native(self._smoothed(system, "forward"))
+    def steered(self, system: System) -> System | None:
+        return smoothed if (smoothed := self._smoothed(system, "forward")).steers else None
 
     def _smoothed(self, system: System, mode: Mode) -> System:
         if self.smoothing is None:
             return system
-        if _native(system) is None:
+        if not system.steers:
             return system.with_contact(self.smoothing)
         # Smoothing of the backward pass alone is in the linear models alone.
         return system.widened(self.smoothing.length) if self.smoothing.mode in ("forward", mode) else system
 
     def warnings(self, system: System, start: StateVector) -> list[str]:
-        if self.smoothing is None or not isinstance(system, SceneSystem) or system.engine.steers:
+        if self.smoothing is None or not isinstance(system, SceneSystem) or system.steers:
             return []
         given, pairs = system.scene.model, [pair for pair in system.scene.pairs if pair.condim > 1]
         if not all(is_known(x) for x in (start, given.geom_size, given.body_pos, given.geom_pos)):
@@ -168,7 +171,7 @@ class Sampled(Smoother):
         def one(noise: _Changes) -> Float[Array, "n both"]:
             moved = lambda change: system.difference(system.retract(state, (noise + change)[:n]), start)  # noqa: E731
             start = system.retract(state, noise[:n])
-            end, jacobian = _linearised(system, start, control + noise[n:])
+            end, jacobian = system.linearised(start, control + noise[n:])
             # A step's derivative is in the tangent spaces at its own start and end, which turn with the noise of a rotation.
             both = jnp.concatenate([jax.jacfwd(moved)(zero), jnp.eye(stddev.size, dtype=state.dtype)[n:]])
             onward = (
@@ -230,23 +233,3 @@ def _sampled(
 def _mean(samples: Float[Array, "N ..."], is_used: Bool[Array, " N"]) -> Float[Array, "..."]:
     used = is_used.reshape(-1, *[1] * (samples.ndim - 1))
     return jnp.where(used, samples, 0.0).sum(axis=0) / jnp.maximum(is_used.sum(), 1)
-
-
-def _native(system: System) -> SceneSystem | None:
-    return system if isinstance(system, SceneSystem) and system.engine.steers else None
-
-
-def _linearised(
-    system: System, state: StateVector, control: ControlVector
-) -> tuple[StateVector, Float[Array, "n both"]]:
-    """Return the next state, and the derivative of its change by state and control."""
-    if (native := _native(system)) is not None:
-        return native.linearised(state, control)
-    n = system.num_changes
-
-    def moved(change):
-        end = system.step(system.retract(state, change[:n]), control + change[n:])
-        return end, end
-
-    jacobian, end = jax.jacfwd(moved, has_aux=True)(jnp.zeros(n + system.num_controls, state.dtype))
-    return end, jax.jacfwd(system.difference)(end, end) @ jacobian

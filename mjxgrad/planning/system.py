@@ -6,7 +6,6 @@ A state is one flat vector. A change of it has the coordinates of the tangent sp
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from mjxgrad._arrays import instance, known, whole
+from mjxgrad._arrays import known, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, kinematics, position_change
@@ -61,6 +60,22 @@ class System(eqx.Module):
     def difference(self, end: StateVector, start: StateVector) -> ChangeVector:
         """Return the change that moves `start` to `end`; the inverse of `retract`."""
         return end - start
+
+    @property
+    def steers(self) -> bool:
+        """Whether it has `steer`, which takes a whole trajectory under a feedback law in one call."""
+        return False
+
+    def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, _Jacobian]:
+        """Return the next state, and the derivative of its change by state and control."""
+        n = self.num_changes
+
+        def moved(change: Float[Array, " both"]) -> tuple[StateVector, StateVector]:
+            end = self.step(self.retract(state, change[:n]), control + change[n:])
+            return end, end
+
+        jacobian, end = jax.jacfwd(moved, has_aux=True)(jnp.zeros(n + self.num_controls, state.dtype))
+        return end, jax.jacfwd(self.difference)(end, end) @ jacobian
 
     def named(self, coordinates: Int[np.ndarray, " some"]) -> str:
         """Return the names of coordinates of a change."""
@@ -145,12 +160,17 @@ class SceneSystem(System):
         """Who steps the scene, see `mjxgrad.engines`."""
         return engine_of(self.scene, self.contact)
 
+    @property
+    def steers(self) -> bool:
+        return self.engine.steers
+
     def steer(self, **law: Array) -> tuple[Float[Array, "states state"], Float[Array, "horizon m"]]:
         """Return states and controls under a feedback law, by an engine that steers."""
         return self.engine.steer(self.scene, self._unflattened(law["states"][0]), self.num_substeps, **law)  # pyright: ignore
 
     def linearised(self, state: StateVector, control: ControlVector) -> tuple[StateVector, _Jacobian]:
-        """Return the next state, and the derivative of its change by state and control, by an engine that steers."""
+        if not self.steers:
+            return super().linearised(state, control)
         given = self.scene, self._unflattened(state), control, self.num_substeps, self.contact
         return self.engine.product(*given)  # pyright: ignore
 
@@ -235,12 +255,6 @@ class Cost(eqx.Module):
         """Return the cost of a trajectory of `horizon + 1` states."""
         stages = jax.vmap(lambda state, control: self.stage(system, state, control))(states[:-1], controls)
         return stages.sum() + self.terminal(system, states[-1])
-
-
-def check_problem(system: Any, cost: Any) -> None:
-    """Refuse what is no system or no cost."""
-    instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
-    instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
 
 
 class LeastSquares(Cost):

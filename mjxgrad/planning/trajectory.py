@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import warnings
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -14,16 +15,7 @@ from mjxgrad._arrays import instance, known, one_key
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
-from mjxgrad.planning.system import (
-    ControlVector,
-    Cost,
-    Quadratic,
-    StateVector,
-    System,
-    check_problem,
-    stage_model,
-    terminal_model,
-)
+from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
 from mjxgrad.rollouts.rollout import sequence_of
 
 _Row = Float[Array, "*iterations"]
@@ -163,11 +155,10 @@ class Problem(eqx.Module):
             control = jnp.clip(jnp.where(follows, moved, control), self.lower, self.upper)
             return smoother.step(self.system, state, control, key), (state, control)
 
-        native = smoother.native(self.system) if isinstance(smoother, Analytic) else None
-        if native is not None:
+        if (steered := smoother.steered(self.system)) is not None:
             given = course.controls + jnp.where(follows, step * law.change, 0.0)
             full = {"controls": given, "gain": law.gain, "follows": follows, "lower": self.lower, "upper": self.upper}
-            states, controls = native.steer(states=course.states[:-1], **full)
+            states, controls = steered.steer(states=course.states[:-1], **full)
         else:
             inputs = (course.states[:-1], course.controls, law.change, law.gain, self.keys)
             final, (states, controls) = jax.lax.scan(advance, course.states[0], inputs)
@@ -255,38 +246,45 @@ def optimise_trajectory(
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
     one_key(key)
-    check_problem(system, cost)
-    instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
-    start = jnp.asarray(start)
-    for message in smoother.warnings(system, start):
-        warnings.warn(message, stacklevel=2)
-    controls, factors, *limits = checked(system, start, controls, schedule, lower, upper)
-    problem = Problem(system, cost, smoother, jax.random.split(key, len(controls)), *limits)
-    return _improved(problem, start, controls, factors)
+    problem, controls, factors = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
+    return _improved(problem, jnp.asarray(start), controls, *factors)
 
 
-def checked(
+def posed(
     system: System,
-    start: Array,
+    cost: Cost,
+    start: ArrayLike | None,
     controls: ArrayLike,
-    schedule: ArrayLike,
+    key: PRNGKeyArray,
+    smoother: Smoother,
+    schedules: Sequence[ArrayLike],
     lower: ArrayLike | None,
     upper: ArrayLike | None,
-) -> tuple[_Controls, Float[Array, " iterations"], ControlVector, ControlVector]:
-    """Return controls, schedule and limits of `optimise_trajectory` as arrays; refuse those that do not fit."""
+) -> tuple[Problem, _Controls, list[Float[Array, " iterations"]]]:
+    """Return the problem, controls and schedules as arrays; refuse what does not fit, and warn of unwanted smoothing.
+
+    A start of None is the system's origin.
+    """
+    instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
+    instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
+    instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
+    start = system.origin if start is None else jnp.asarray(start)
+    for message in smoother.warnings(system, start):
+        warnings.warn(message, stacklevel=3)
     sequence_of(controls, None, None, system.num_controls)
     dtype, shape, own = start.dtype, (system.num_controls,), system.control_limits
-    controls, factors = jnp.asarray(controls, dtype), jnp.asarray(schedule, dtype)
+    controls, factors = jnp.asarray(controls, dtype), [jnp.asarray(one, dtype) for one in schedules]
     lower = jnp.broadcast_to(jnp.asarray(own[0] if lower is None else lower, dtype), shape)
     upper = jnp.broadcast_to(jnp.asarray(own[1] if upper is None else upper, dtype), shape)
-    if factors.ndim != 1 or not factors.size:
-        raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {factors.shape}")
-    given, low, high = known(factors), known(lower), known(upper)
-    if given is not None and not (given > 0).all():
-        raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
+    for one in factors:
+        if one.ndim != 1 or not one.size:
+            raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {one.shape}")
+        if (given := known(one)) is not None and not (given > 0).all():
+            raise ValueError(f"schedule must be positive, got {given.min():g}: for no smoothing take Exact()")
+    low, high = known(lower), known(upper)
     if low is not None and high is not None and not (low <= high).all():
         raise ValueError(f"lower must be at most upper, got {low} and {high}")
-    return controls, factors, lower, upper
+    return Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper), controls, factors
 
 
 @compiled
@@ -295,7 +293,16 @@ def _improved(problem: Problem, start: StateVector, controls: _Controls, factors
     # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
     inputs = (present, following, jnp.arange(len(present)) == 0)
-    found, rows = jax.lax.scan(lambda search, at: iterate(problem, search, *at), problem.begin(start, controls), inputs)
+    none = jnp.zeros((0, *controls.shape))
+
+    def iterate(search: Search, at: tuple[_Scalar, _Scalar, Bool[Array, ""]]) -> tuple[Search, Iterations]:
+        factor, following, is_first = at
+        improved = lambda: problem.solved(problem.linearised(search, factor))  # noqa: E731
+        search = jax.lax.cond(is_first, lambda: search, improved)
+        search, true, step = problem.chosen(search, following, is_first, none)
+        return search, Iterations(factor, search.course.cost, true, step, search.law.promised)
+
+    found, rows = jax.lax.scan(iterate, problem.begin(start, controls), inputs)
     start_cost, rows = rows.cost[0], jax.tree.map(lambda x: x[1:], rows)
     return Plan(
         controls=found.best.controls,
@@ -307,16 +314,6 @@ def _improved(problem: Problem, start: StateVector, controls: _Controls, factors
         converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(found.course.cost)) & ~found.unmoved.any(),
         diverged=~jnp.all(jnp.isfinite(rows.smoothed_cost)),
     )
-
-
-def iterate(
-    problem: Problem, search: Search, factor: _Scalar, following: _Scalar, is_first: Bool[Array, ""]
-) -> tuple[Search, Iterations]:
-    """Take one iteration under a factor of the smoothing; the first one computes the course of the given controls alone."""
-    improved = lambda: problem.solved(problem.linearised(search, factor))  # noqa: E731
-    search = jax.lax.cond(is_first, lambda: search, improved)
-    search, true, step = problem.chosen(search, following, is_first, jnp.zeros((0, *search.course.controls.shape)))
-    return search, Iterations(factor, search.course.cost, true, step, search.law.promised)
 
 
 def shifted(plan: Plan | Course, num_steps: ArrayLike = 1) -> _Controls:

@@ -36,7 +36,7 @@ def system(error):
 
 def by_steps(monkeypatch):
     """From here on plans call C MuJoCo in each step."""
-    monkeypatch.setattr(Analytic, "native", lambda smoother, system: None)
+    monkeypatch.setattr(Analytic, "steered", lambda smoother, system: None)
 
 
 def start_of(system):

@@ -11,8 +11,8 @@ from scipy.stats import norm
 import mjxgrad as mg
 from mjxgrad.bodies.kinematics import position_change
 from mjxgrad.planning.linear_model import Analytic, Exact
-from mjxgrad.planning.system import SceneSystem
-from mjxgrad.planning.trajectory import checked
+from mjxgrad.planning.system import GoalCost, SceneSystem
+from mjxgrad.planning.trajectory import posed
 from mjxgrad.stepping import Smoothing, own_motion
 from tests.scenes import PUSHED_BALL
 
@@ -44,9 +44,11 @@ def test_a_ball_on_a_spring_is_found_without_error(gradient):
 def test_limits_are_those_of_the_actuators_unless_others_are_given():
     ranged = SPRING.replace('<motor joint="x"/>', '<motor joint="x"/><motor joint="x" ctrlrange="-2 3"/>')
     system = SceneSystem(mg.load_scene(ranged))
-    given = (system, system.origin, np.zeros((1, 2)), np.ones(1))
-    np.testing.assert_array_equal(checked(*given, None, None)[2:], [[-np.inf, -2], [np.inf, 3]])
-    np.testing.assert_array_equal(checked(*given, -1.0, None)[2:], [[-1, -1], [np.inf, 3]])
+    cost, key = GoalCost(system.origin, 1.0, 1.0, 1.0), jax.random.key(0)
+    given = (system, cost, None, np.zeros((1, 2)), key, Exact(), [np.ones(1)])
+    for lower, least in ((None, [-np.inf, -2]), (-1.0, [-1, -1])):
+        problem, *_ = posed(*given, lower, None)
+        np.testing.assert_array_equal([problem.lower, problem.upper], [least, [np.inf, 3]])
 
 
 RAILS = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
