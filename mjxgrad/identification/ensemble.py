@@ -5,15 +5,15 @@ cell between two jumps. The mean of motions whose values and starts differ a lit
 window, in units of the noise, of motions with values $\theta_i$ about $\bar\theta$ and starts $s_i$ about $\bar s$. The linear
 regression $r_i = \mu + J (\theta_i - \bar\theta) + K (s_i - \bar s) + e_i$ separates the effects of values and start from
 chatter. The recording is one more such motion. Generalised least squares with the covariance $\sigma^2 + \mathrm{cov}(e)$ give
-the next $\bar\theta$ and $\bar s$ and their covariance, from which the next motions are drawn, until both stay. The first
-motions spread wider than any answer, so that the covariance shrinks to what chatter allows and not to a cell.
+the next $\bar\theta$ and $\bar s$ and their covariance. From twice its width the next motions are drawn, until both stay: among
+motions that differ by less, fewer switches differ, and the covariance would shrink to a cell. In the end further motions stand
+for recordings of known values. Their errors widen the intervals until 95 % of them hold.
 
 References:
     Evensen. Analysis of iterative ensemble smoothers for solving inverse problems. Computational Geosciences 22 (2018).
-    Hartlap, Simon, Schneider. Why your model parameter confidences might be too optimistic. A&A 464 (2007).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -28,12 +28,14 @@ _MOTIONS, _PER_NUMBER = 192, 8  # motions of an ensemble at least, and for each 
 _MOST = 16  # ensembles
 _MORE = 4  # times as many motions at most
 _NARROWER, _WIDER = 0.25, 2.0  # widths that are kept from before; where the mean has missed
+_APART = 2.0  # standard errors by which the next motions differ: chatter grows with it, so one would shrink to a cell
 # Factors of its variance; standard errors of a sum of squares beyond which it is more.
 _CHATTER, _EXCESS = (1.5, 3.0, 6.0, 12.0), 1.0
 _LONGEST = 3.0  # widths that a step goes at most
 _SHORT, _SETTLED = 0.7, 1.5  # at the end: step of each number in widths; ratio of successive widths
 # Ensembles at least, and those at the end of which the mean is the answer: each has its scatter.
 _FEWEST, _AVERAGED = 3, 3
+_HALF_WIDTH = 1.96  # of an interval that holds at 95 %, in standard errors
 
 Box = tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]
 Motions = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -88,9 +90,8 @@ def fit(
         if len(drawn) < 2 * (dim + free) + 2:
             raise DivergedError("most motions must stay finite about the best values, got few: give narrower bounds")
         middle, centres = drawn.mean(axis=0), starts.mean(axis=0)
-        factors, sureness, step = _explained(
-            Regression(drawn, starts, residuals[is_finite]), noise, (box[0] - middle, box[1] - middle), dim, most
-        )
+        model = Regression(drawn, starts, residuals[is_finite])
+        factors, chatter, step = _explained(model, noise, (box[0] - middle, box[1] - middle), dim, most)
         length = float(np.linalg.norm(np.linalg.lstsq(law.root, step.values, rcond=None)[0]))
         change = step.values * min(1.0, _LONGEST / max(length, 1e-300))
         moved, misfit = at(factors, change)
@@ -103,9 +104,13 @@ def fit(
         stays = length < _SHORT * np.sqrt(dim) and bool((before.variances < _SETTLED**2 * law.variances).all())
         is_short = stays and not has_missed and index >= _FEWEST
         ends = [*ends, law] if is_short or ends else []
-        found = _mean_of(ends or [law], factors * sureness, misfit, drawn)
+        found = _mean_of(ends or [law], factors, misfit, drawn)
+        is_last = found.is_settled or index == _MOST
+        if is_last:
+            errors = _tried(model, motions, before.draw(num, rng, box), noise, chatter)
+            found = found._replace(factors=found.factors / max(1.0, float(np.quantile(errors, 0.95)) / _HALF_WIDTH))
         say(found)
-        if found.is_settled or index == _MOST:
+        if is_last:
             return found
 
 
@@ -135,22 +140,29 @@ def _law(
 ) -> _Law:
     """Return what the next motions are drawn from: what factors leave open, a share of the former law, and the last change."""
     by_start, mixed, slope, _ = split(factors, len(values))
-    inner, root = np.linalg.pinv(by_start), growth * np.linalg.pinv(slope, rcond=1e-9)
+    inner, root = np.linalg.pinv(by_start), _APART * growth * np.linalg.pinv(slope, rcond=1e-9)
     covariance = root @ root.T + kept @ kept.T + np.outer(change, change) + 1e-14 * np.eye(len(values))
     along = -np.einsum("wij,wjk->wik", inner, mixed[..., :-1])
     return _Law(values, starts, np.linalg.cholesky(covariance), growth * inner, along)
 
 
 def _explained(model: "Regression", noise: float, room: Box, dim: int, most: float) -> tuple[np.ndarray, float, Step]:
-    """Return factors, how sure they are, and the step; chatter counts for more until it explains what recordings have more."""
-    factors, sureness = model.weighed(noise, _CHATTER[0])
-    step = solved(factors, dim, room)
-    for chatter in _CHATTER[1:]:  # its tails are longer than the normal's
+    """Return factors, how much chatter they count, and the step: as much as explains what recordings have more than noise."""
+    for chatter in _CHATTER:  # its tails are longer than the normal's
+        factors = model.weighed(noise, chatter)
+        step = solved(factors, dim, room)
         if step.squares < most:
             break
-        factors, sureness = model.weighed(noise, chatter)
-        step = solved(factors, dim, room)
-    return factors, sureness, step
+    return factors, chatter, step
+
+
+def _tried(
+    model: "Regression", motions: Motions, drawn: tuple[np.ndarray, np.ndarray], noise: float, chatter: float
+) -> Float[np.ndarray, "motions dim"]:
+    """Return by how many standard errors the values of further motions are missed."""
+    residuals = motions(*drawn)
+    is_finite = np.isfinite(residuals).all(axis=(1, 2))
+    return np.abs(model.errors(drawn[0][is_finite], residuals[is_finite], noise, chatter))
 
 
 def _mean_of(ends: list[_Law], factors: np.ndarray, misfit: float, drawn: np.ndarray) -> Ensemble:
@@ -158,7 +170,7 @@ def _mean_of(ends: list[_Law], factors: np.ndarray, misfit: float, drawn: np.nda
     values, starts = np.mean([one.values for one in ends], axis=0), np.mean([one.starts for one in ends], axis=0)
     factors[..., -1] = 0.0  # nothing is left to go
     if len(ends) > 1:
-        scatter = np.var([one.values for one in ends], axis=0, ddof=1) / ends[-1].variances
+        scatter = np.var([one.values for one in ends], axis=0, ddof=1) / (ends[-1].variances / _APART**2)
         factors /= np.sqrt(1.0 + scatter.mean() / len(ends))
     return Ensemble(values, starts, factors, misfit, drawn, len(ends) == _AVERAGED)
 
@@ -170,28 +182,51 @@ class Regression:
         self, drawn: Float[np.ndarray, "motions dim"], free: Float[np.ndarray, "motions windows free"],
         residuals: Float[np.ndarray, "motions windows numbers"],
     ):  # fmt: skip
-        self._parts, self._count, self._width = [], len(drawn), 1 + drawn.shape[1] + free.shape[2]
+        self._middle, self._count, self._width = drawn.mean(axis=0), len(drawn), 1 + drawn.shape[1] + free.shape[2]
+        self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         for starts, one in zip(free.swapaxes(0, 1), residuals.swapaxes(0, 1), strict=True):
-            away = np.column_stack([starts - starts.mean(axis=0), drawn - drawn.mean(axis=0), np.ones(self._count)])
+            away = np.column_stack([starts - starts.mean(axis=0), drawn - self._middle, np.ones(self._count)])
             columns = np.linalg.pinv(away) @ one
-            left = one - away @ columns
-            self._parts.append((columns @ columns.T, left @ columns.T, left @ left.T))
+            self._parts.append((columns, one - away @ columns))
 
-    def weighed(self, noise: float, chatter: float = 1.0) -> tuple[Float[np.ndarray, "windows columns columns"], float]:
+    def _weighed(self, noise: float, chatter: float) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
+        """Yield, by window, the product of all columns with others, weighed by the covariance of noise and chatter."""
+        scale = max(self._count - self._width, 1) * noise**2 / chatter
+        for columns, left in self._parts:
+            # (σ² + e e'/n)⁻¹ = (1 - e (n σ² + e'e)⁻¹ e') / σ², in the space of motions, which are fewer than numbers.
+            gram = left @ left.T
+            kept = np.linalg.solve(max(scale, 1e-12 * np.trace(gram)) * np.eye(self._count) + gram, left @ columns.T)
+            yield lambda others, columns=columns, left=left, kept=kept: columns @ others - kept.T @ (left @ others)
+
+    def weighed(self, noise: float, chatter: float = 1.0) -> Float[np.ndarray, "windows columns columns"]:
         """Return factors of mean residual and derivatives over the root of the covariance, times the noise.
 
-        The covariance is that of noise and chatter, the latter by a factor. Its inverse by few motions is too large (Hartlap et
-        al.): the second result is the factor of derivatives for that.
+        The covariance is that of noise and chatter, the latter by a factor.
         """
-        found, told = [], []
-        scale = max(self._count - self._width, 1) * noise**2 / chatter
-        for plain, along, left in self._parts:
-            # (σ² + e e'/n)⁻¹ = (1 - e (n σ² + e'e)⁻¹ e') / σ², in the space of motions, which are fewer than numbers.
-            inverse = np.linalg.inv(max(scale, 1e-12 * np.trace(left)) * np.eye(self._count) + left)
-            gram = plain - along.T @ inverse @ along
-            told.append(self._count - scale * np.trace(inverse))
+        found = []
+        for (columns, _), product in zip(self._parts, self._weighed(noise, chatter), strict=True):
+            gram = product(columns.T)
             sizes = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
             values, axes = np.linalg.eigh(gram / np.outer(sizes, sizes))
             root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T * sizes
             found.append(np.linalg.qr(root, mode="r"))
-        return np.stack(found), float(np.sqrt(max(1.0 - np.mean(told) / self._count, 0.1)))
+        return np.stack(found)
+
+    def errors(
+        self, drawn: Float[np.ndarray, "motions dim"], residuals: Float[np.ndarray, "motions windows numbers"],
+        noise: float, chatter: float,
+    ) -> Float[np.ndarray, "motions dim"]:  # fmt: skip
+        """Return errors of the values that other motions would be given if they were recorded, in standard errors."""
+        rng, dim = np.random.default_rng(1), drawn.shape[1]
+        slope, seen = np.zeros((dim, dim)), np.zeros((dim, len(drawn)))
+        for (columns, _), product, one in zip(
+            self._parts, self._weighed(noise, chatter), residuals.swapaxes(0, 1), strict=True
+        ):
+            free = len(columns) - dim - 1
+            gram, told = product(columns.T), product((one + noise * rng.normal(size=one.shape) - columns[-1]).T)
+            inner = gram[:-1, :free] @ np.linalg.pinv(gram[:free, :free], hermitian=True)
+            slope += gram[free:-1, free:-1] - inner[free:] @ gram[:free, free:-1]
+            seen += told[free:-1] - inner[free:] @ told[:free]
+        inverse = np.linalg.pinv(slope, rcond=1e-12, hermitian=True)
+        sizes = np.sqrt(np.diag(inverse))
+        return ((inverse @ seen).T - (drawn - self._middle)) / np.where(sizes > 0, noise * sizes, np.inf)

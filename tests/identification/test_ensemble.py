@@ -8,7 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.identification import Recording
-from mjxgrad.identification.ensemble import fit
+from mjxgrad.identification.ensemble import Regression, fit
 from mjxgrad.identification.normal import split
 from mjxgrad.identification.recording import after_start, spread, stack
 
@@ -53,6 +53,18 @@ def test_values_and_covariance_are_those_of_generalised_least_squares(chatter):
     *_, at_end, _ = split(found.factors, 2)
     np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(at_end.T @ at_end))), error, rtol=0.3)
     assert found.squares < 1.5 * 126
+
+
+@pytest.mark.parametrize(("count", "expected"), [(4000, 1.0), (100, 1.6)])
+def test_motions_taken_for_recordings_tell_how_sure_the_values_are(count, expected):
+    """Of 100 motions a covariance of 60 numbers is known so badly that errors exceed their standard errors by half and more."""
+    rng = np.random.default_rng(0)
+    motions, *_ = _problem(1.0, 3.0, rng)
+    draw = lambda num: (0.1 * rng.normal(size=(num, 2)), rng.normal(size=(num, _WINDOWS, 3)))  # noqa: E731
+    told, others = draw(count), draw(500)
+    found = Regression(*told, motions(*told)).errors(others[0], motions(*others), 1.0, 1.0)
+    size = float(np.sqrt(np.mean(found**2)))
+    assert abs(size / expected - 1) < 0.25
 
 
 def test_motions_that_diverge_do_not_count_unless_most_do():
