@@ -35,7 +35,6 @@ class Motion(eqx.Module):
     policy_sees: Sees
     checkpoint: bool
     contact: Contact
-    measure_growth: bool
 
 
 class Rows(eqx.Module):
@@ -48,43 +47,31 @@ class Rows(eqx.Module):
 
 @runtime_checkable
 class Engine(Protocol):
-    """Who steps a scene.
+    """Who steps a scene."""
 
-    Attributes:
-        title: its name in a sentence.
-        contacts: the ways of contact that it steps; others are stepped by MJX.
-        compiles: whether its programs are compiled, and worth keeping.
-        steers: whether it has `steer` and `product`, which take a whole trajectory in one call.
-    """
-
-    title: ClassVar[str]
-    contacts: ClassVar[tuple[type, ...]]
-    compiles: ClassVar[bool]
-    steers: ClassVar[bool]
+    title: ClassVar[str]  # its name in a sentence
+    contacts: ClassVar[tuple[type, ...]]  # the ways of contact that it steps; others are stepped by MJX
+    compiles: ClassVar[bool]  # whether its programs are compiled, and worth keeping
+    steers: ClassVar[bool]  # whether it has `steer` and `product`, which take a whole trajectory in one call
 
     def complete(self, scene: Scene, state: State, contact: Contact) -> State:
         """Return a state with all that this engine goes on with from one rollout to the next."""
-        ...
 
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
         """Return the result of `rollout`, for checked arguments."""
-        ...
 
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
     ) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C and D of one step, see `rollouts.Linearisation`."""
-        ...
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
         """Return the state after a control was held for some steps; differentiable."""
-        ...
 
     def look(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
     ) -> PyTree:
         """Return what a function of model and data sees in a state under a control and other inputs; differentiable."""
-        ...
 
 
 def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:

@@ -1,52 +1,38 @@
 r"""The slope of C MuJoCo's outcome: derivatives of a step that know of the contacts and limits about to begin or end.
 
 MuJoCo decides once per step whether a contact or limit acts, by the sign of its gap r (distance less margin). The step is
-therefore a smooth map with jumps at r = 0, and its Jacobian A₀, by differences of any small width, does not see them. Yet a
-change of the start moves each crossing to another step, and the slope of the outcome has that in it. Where trajectories that
-differ in phase fill the gap evenly, as in flight, the expected derivative of a step is that over the travel of one step about
-r = 0:
+therefore a smooth map with jumps at r = 0, which its Jacobian A₀, by differences of any small width, does not see. Yet a
+change of the start moves each crossing to another step. Where trajectories that differ in phase fill the gap evenly, as in
+flight, the expected derivative of a step is that over the travel of one step about r = 0:
 
     A = A₀ (1 - P L) + D L,        D_i = (f(q⁺_i) - f(q⁻_i)) / 2w_i,        L = (J, τJ),        J P = 1,
 
 for the events i, the rows with |r_i| < w_i. J holds their normal rows, P displacements of which each changes one gap alone, and
-q±_i is the present position moved along P_i until its gap is ±w_i. So D_i holds the jump and the mean derivative to both sides,
-and each crossing of a surface is met by one step. It lies τ = -r / Jv from the start of that step, and velocities shift it, too.
-A₀ serves all directions that leave the crossing as it is. It is a matrix of rank one per event, as saltation matrices are, so
-an event costs four more steps, and a step without any costs nothing.
+q±_i is the present position moved along P_i until its gap is ±w_i. Each crossing is met by one step, and lies τ = -r / Jv from
+its start. A is a matrix of rank one per event, as saltation matrices are: an event costs four more steps.
 
-- **Followed.** f(q⁺) has not been pushed yet, and what follows is not linear between two states so far apart: friction ends,
-  a short contact lets go, one that chatters comes back. So both go on, step by step, until A₀ explains how they differ. Changes
-  then go two ways, x' = A₀ (1 - P L) x + D_k x₋, with D_k the difference after k steps and x₋ what the event felt before them.
-  Until then D_j x₋ is the outcome's alone. See `engines.flight`. Without, derivatives of gymnasium's hopper scatter ten to thirty
-  times as far, and chatter multiplies them at each event: those of a ball that a box pushes scatter by 93, not 0.26.
-
-- **Together.** The corners of a box that lands flat cross their surface in one step, and what each does depends on the others.
-  Contacts that share coordinates are therefore taken by modes, the left singular vectors of their rows: all gaps alike, then
-  tilts. A mode is as large as moves one gap by 1, and q± lies about the position where all of their gaps are zero. Modes that
-  move something ten times as far as a gap are left to A₀. A limit bounds one coordinate and stays an event of its own.
-- **Several stages.** A Runge-Kutta step looks at the contacts at four places along its way. A window about -hv/2, somewhat
-  wider, holds all of them, with as much less weight. Both motions are followed for two steps alone: on gymnasium's robots
-  derivatives then scatter half as far.
-- **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), with v and v' the velocities before and after the step, and ε = 0.06 of the
-  impedance's width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply. These move by about as much as
-  a step of free acceleration a, less what damping keeps of it, h² |J a|. ε is no larger, since a window that is wider than the
-  travel of what lands or creeps slowly biases it; and it is at most four steps of travel, since a contact that rests a few
-  micrometres deep crosses nothing. As events, resting corners of a box that an arm pushes took most of its gradient's time.
-- **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of
-  its bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
-- **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm.
-  The lowest point of a standing cylinder, or a lying mesh, runs along its rim at tilts of the size of rounding.
-  Small differences see that, and multiplied motions by 1e30 in fifty steps.
-- **Undecided.** A gap that no coordinate moves and that is zero to rounding (a robot that slides in a plane on the floor) opens
-  and closes at random. Differences are then taken with margins by which it stays as it was in the step itself.
-- **Small differences** are those of `engines.inverse`. Where a gap is smaller than they are, they are taken a little farther off,
-  also for "discrete" gradients. Where they are steeper than any contact, they step over another jump, as of a stage of
-  Runge-Kutta that meets a surface; then those of whole steps are taken, and narrower ones.
+- **Followed.** f(q⁺) has not been pushed yet, and what follows is not linear between two states so far apart. So both go on until
+  A₀ explains how they differ, see `engines.flight`. Without, derivatives of a hopper scatter ten to thirty times as far.
+- **Together.** What each corner of a box that lands flat does depends on the others. Contacts that share coordinates are taken by
+  modes, the left singular vectors of their rows. A mode is as large as moves one gap by 1, and q± lies about the position where
+  all of their gaps are zero. Modes that move something ten times as far as a gap are left to A₀, and limits are alone.
+- **Several stages.** A Runge-Kutta step looks at contacts at four places along its way. A window about -hv/2, somewhat wider,
+  holds all, with as much less weight. Both motions are followed for two steps alone.
+- **Width.** w = max(h/2 |J v|, h/2 |J v'|, ε), v and v' the velocities before and after the step, ε = 0.06 of the impedance's
+  width, at most 0.06 mm or mrad. v' and ε bound what contacts that chatter multiply; these move by h² |J a|, less what damping
+  keeps. Wider windows are biased, and ε is at most four steps of travel: a contact that rests crosses nothing.
+- **Displacement.** P is the smallest that changes the gaps by 1, measured by how far a coordinate moves the farthest point of its
+  bodies. Other rows that it would carry across zero (a knee at its limit under a foot that lands) are held where they are.
+- **Geometry.** Where edges or corners touch, A₀ is along 1 - P J, by displacements that move a body's farthest point 0.06 mm. The
+  lowest point of a standing cylinder runs along its rim at tilts of the size of rounding, and small differences see that.
+- **Undecided.** A gap that no coordinate moves and that is zero to rounding opens and closes at random. Differences are then
+  taken with margins by which it stays as it was in the step itself.
+- **Small differences** are those of `engines.inverse`, taken a little farther off where a gap is smaller than they are, also for
+  "discrete" gradients. Where they are steeper than any contact, whole steps and narrower differences take their place.
 - **Sizes and places.** What moves a gap at a rate R (a radius, a mocap body's place, a joint's range) moves the crossing as
   displacements P R do, and has D R. Its small differences are taken at the same gap, that is with -P R added to the position.
-- **Reach.** Velocities, activations and controls do not move gaps within the step: small differences serve them.
-  Jumps that are no event remain unseen: hit or miss, an edge that catches.
-  Where the phases of a motion do not fill several steps the slope is ill defined.
+- **Limits.** Jumps that are no event remain unseen: hit or miss, an edge that catches. Where the phases of a motion do not fill
+  several steps the slope is ill defined.
 
 References:
     Kong, Payne, Zhu, Johnson. Saltation matrices: the essential tool for linearizing hybrid dynamical systems. arXiv:2306.06862.
@@ -78,56 +64,31 @@ _Mask = Bool[np.ndarray, " rows"]
 
 @dataclass(frozen=True)
 class Events:
-    """Contacts and limits that a step may begin or end, by modes.
+    """Contacts and limits that a step may begin or end, by modes."""
 
-    Attributes:
-        rows: J, the rate of each mode by joint velocity.
-        ahead: Jτ, what a joint velocity adds to each mode until the time of the crossing (s).
-        moves: P, the displacement that changes one mode by one and leaves the others.
-        middles: the displacement to the middle of what is spanned, where the gaps of the mode's events are zero.
-        widths: half of what is spanned (m or rad).
-        surfaces: J of the events themselves.
-        gaps: their distances less margins at present (m or rad).
-        centres: their gaps in the middle; zero, but for steps of several stages (m or rad).
-        weights: how much each event counts in each mode.
-        index: which of all rows they are.
-    """
-
-    rows: Float[np.ndarray, "modes nv"]
-    ahead: Float[np.ndarray, "modes nv"]
-    moves: Float[np.ndarray, "nv modes"]
-    middles: Float[np.ndarray, "nv modes"]
-    widths: Float[np.ndarray, " modes"]
-    surfaces: Float[np.ndarray, "events nv"]
-    gaps: Float[np.ndarray, " events"]
-    centres: Float[np.ndarray, " events"]
-    weights: Float[np.ndarray, "modes events"]
-    index: Int[np.ndarray, " events"]
+    rows: Float[np.ndarray, "modes nv"]  # J, the rate of each mode by joint velocity
+    ahead: Float[np.ndarray, "modes nv"]  # Jτ, what a joint velocity adds to each mode until the crossing (s)
+    moves: Float[np.ndarray, "nv modes"]  # P, the displacement that changes one mode by one and leaves the others
+    middles: Float[np.ndarray, "nv modes"]  # the displacement to where the gaps of the mode's events are zero
+    widths: Float[np.ndarray, " modes"]  # half of what is spanned (m or rad)
+    surfaces: Float[np.ndarray, "events nv"]  # J of the events themselves
+    gaps: Float[np.ndarray, " events"]  # their distances less margins at present (m or rad)
+    centres: Float[np.ndarray, " events"]  # their gaps in the middle; zero, but for steps of several stages (m or rad)
+    weights: Float[np.ndarray, "modes events"]  # how much each event counts in each mode
+    index: Int[np.ndarray, " events"]  # which of all rows they are
 
 
 @dataclass(frozen=True)
 class Near:
-    """Contacts and limits near a position.
+    """Contacts and limits near a position."""
 
-    Attributes:
-        events: those that the step may begin or end, or None.
-        rough: the velocities that move one body of a contact that acts, or may, where a body has edges or corners.
-        is_undecided: whether rounding decides if a contact or limit acts.
-        rows: J of the other contacts and limits whose force begins with a jump.
-        gaps: their gaps (m or rad).
-        lengths: how far each joint velocity moves the farthest point of its bodies (m or 1).
-    """
-
-    events: Events | None
+    events: Events | None  # those that the step may begin or end, or None
+    # The velocities that move one body of a contact that acts, or may, where a body has edges or corners.
     rough: Int[np.ndarray, " some"]
-    is_undecided: bool
-    rows: Float[np.ndarray, "others nv"]
-    gaps: Float[np.ndarray, " others"]
-    lengths: _PerDof
-
-    @property
-    def is_rough(self) -> bool:
-        return len(self.rough) > 0
+    is_undecided: bool  # whether rounding decides if a contact or limit acts
+    rows: Float[np.ndarray, "others nv"]  # J of the other contacts and limits whose force begins with a jump
+    gaps: Float[np.ndarray, " others"]  # their gaps (m or rad)
+    lengths: _PerDof  # how far each joint velocity moves the farthest point of its bodies (m or 1)
 
     def widths(self, changes: Float[np.ndarray, "some nv"]) -> Float[np.ndarray, " some"]:
         """Return by how many times each displacement moves a body's farthest point a hair's breadth, across no surface."""
@@ -147,8 +108,7 @@ class Surfaces:
         self.timestep, self.is_moved = model.opt.timestep, levers > 0
         self.longest = max(1.0, self.lengths.max(initial=0.0))
         self.kept = kept_by_damping(model)
-        # How far ahead of the start of a step its stages lie, in the mean (s).
-        self.lead = 0.5 * self.timestep * (model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4)
+        self.has_stages = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         # The last entry is for -1, the vertices of flexible bodies.
         self.is_rough = np.append(~np.isin(model.geom_type, _SMOOTH), False)
         self.plain, self.model = model, copy.deepcopy(model)
@@ -162,7 +122,7 @@ class Surfaces:
 
     def _reach(self, speed: _PerDof) -> tuple[float, float]:
         """Return how far contacts and limits travel in half a step at most."""
-        travel, least = (0.5 * self.timestep + 2 * self.lead) * speed, slope.LEAST_WIDTH * slope.USUAL_WIDTH
+        travel, least = self.timestep * (1.5 if self.has_stages else 0.5) * speed, slope.LEAST_WIDTH * slope.USUAL_WIDTH
         return float(np.sort(self.levers @ travel)[-2:].sum()) + least, float(travel.sum() * self.longest) + least
 
     def beside(self, change: float, data: mujoco.MjData) -> tuple[_PerDof | None, bool]:
@@ -188,14 +148,15 @@ class Surfaces:
         # What is near one state may not depend on how fast others move.
         gaps = np.where(gaps < np.where(is_contact, *self._reach(np.abs(before))), gaps, np.inf)
         rate, centres = rows @ before, np.zeros(len(rows))
-        widths = 0.5 * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
-        if self.lead:
-            # Its stages meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
-            centres, widths = -self.lead * rate, slope.STAGES * widths
+        travel = self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
+        widths = 0.5 * travel
+        if self.has_stages:
+            # They meet the surface at gaps of 0, -hv/2 and -hv, and a little beyond where v changes on the way.
+            centres, widths = -0.5 * self.timestep * rate, slope.STAGES * widths
         fall = self.timestep**2 * np.abs(rows @ (self.kept * free))
         # A contact that rests crosses nothing, however near its surface it rests.
-        stirred = slope.STIRRED * self.timestep * np.maximum(np.abs(rate), np.abs(rows @ after))
-        widths = np.maximum(widths, np.minimum(least, np.maximum(np.minimum(fall, stirred), slope.SMALLEST)))
+        slow = np.maximum(np.minimum(fall, slope.STIRRED * travel), slope.SMALLEST)
+        widths = np.maximum(widths, np.minimum(least, slow))
         is_rough &= gaps - centres < widths
         is_moved = self._moves(rows)
         is_undecided = jumps & ~is_moved & (np.abs(gaps) < _ROUNDING)
@@ -224,7 +185,6 @@ class Surfaces:
         return np.flatnonzero((first != second).any(axis=0))
 
     def _moves(self, rows: _Rows) -> _Mask:
-        """Return which rows some coordinate moves."""
         return np.linalg.norm(rows / self.lengths, axis=1) > 1 / slope.FARTHEST
 
     def gaps(self, data: mujoco.MjData) -> tuple[bytes, _PerRow]:
@@ -364,7 +324,6 @@ def _by_modes(
 
 
 def _connected(moved: Bool[np.ndarray, "rows nv"]) -> Int[np.ndarray, " rows"]:
-    """Return a number for each row, the same where rows share coordinates, directly or by others."""
     shares = (moved.astype(float) @ moved.T > 0) | np.eye(len(moved), dtype=bool)
     group = np.arange(len(moved))
     while not np.array_equal(group, least := np.where(shares, group, len(group)).min(axis=1)):

@@ -1,8 +1,8 @@
 r"""Two motions from either side of an event, followed while the derivative along the motion does not say how they differ.
 
-A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After
-a few steps both have been, and differ little. Between, the outcome's change is D_j h, with D_j the difference of the two motions
-after j steps over their distance before, and h the share of that distance by which a change moves the event. Changes go two ways:
+A step that spans an event has a large derivative: one side was pushed by a contact, the other is pushed a step later. After a few
+steps both have been, and differ little. Between, the outcome's change is D_j h, with D_j the difference of the two motions after
+j steps over their distance before, and h the share of that distance by which a change moves the event. Changes go two ways:
 
     x' = A x + b,        h' = keep (h + slots (F x + f)),        whole change = x' + D h'.
 
@@ -11,17 +11,16 @@ A is the derivative along the motion without events, F what each event that begi
 - **Explained.** A pair is explained after three steps in a row in which D' is A D to a twentieth. An event between the two adds
   its jump to A D. If it is less far apart than half of the event's window, it may add what a small difference does instead.
 - **Let go.** Once explained, it is let go if it is at most ten times as far apart as at first; or, at an event, if it is less far
-  apart than the event's own window. That event then has a better mean of its phases than two motions have. Motions that are
-  farther apart span many phases of the next event, where a derivative multiplies. After a hundred steps all are let go.
+  apart than the event's own window, which is then a better mean. After a hundred steps all are let go.
 - **Slots.** Where a motion has no more room for pairs, explained ones are let go, and then events begin none but are those of a
-  discrete gradient. A jump that is let go unexplained is multiplied by what follows: a hopping sledge's to 4000 times the slope.
+  discrete gradient. A jump that is let go unexplained is multiplied by what follows.
 
-A landing is over after four steps. Chatter goes on for longer, and there this matters: a derivative is multiplied at each event,
-a difference of two motions is not.
+A landing is over after four steps. Chatter goes on for longer: a derivative is multiplied at each event, a difference is not.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,33 +30,47 @@ from mjxgrad.engines.layout import Layout
 from mjxgrad.stepping import slope
 
 NUM_SLOTS = 96
+_Step = Callable[[np.ndarray, list[mujoco.MjModel]], np.ndarray]  # from states and models to the states after a step
+PAIRS = ("felt", "slot", "apart", "stays")
+"""Of a slope, beside "state": what each event that begins feels, its slot, D of each slot, and whether a slot goes on."""
+FIRST = ("before", "enters")
+"""D before the first step, and which slots go on into it."""
+
+
+def begin(total: Any, held: Any, first: dict[str, Any]) -> tuple[Any, Any]:
+    """Return a change without what is in flight, and what is, before the first step."""
+    held = (first["enters"][:, None] if held.ndim > 1 else first["enters"]) * held
+    return total - first["before"] @ held, held
+
+
+def advance(xp: Any, main: Any, held: Any, step: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """Return the change along one motion, what is in flight after a step, and the whole change, by `numpy` or `jax.numpy`."""
+    # This is the one place where derivatives of steps are composed. `main` may have several columns. A step has "state"
+    # and "by state", what it adds to a change; of a slope, "felt", "by felt", "slot", "apart", "stays".
+    end = step["state"] @ main + step["by state"]
+    if "felt" not in step:
+        return end, held, end
+    slots = (step["slot"] == xp.arange(len(held))[:, None]).astype(end.dtype)
+    held = held + slots @ (step["felt"] @ main + step["by felt"])
+    total = end + step["apart"] @ held
+    kept = (step["stays"][:, None] if held.ndim > 1 else step["stays"]) * held
+    return total - step["apart"] @ kept, kept, total
 
 
 @dataclass
 class Begun:
-    """Pairs that begin in a step, one for each mode of its events.
+    """Pairs that begin in a step, one for each mode of its events."""
 
-    Attributes:
-        felt: F, by a change.
-        ends: both motions after the step.
-        widths: how far apart each pair began.
-        apart: D after the step.
-        lost: small differences along the displacements that events replace.
-        longest: after how many steps these pairs are let go in any case.
-        by_others: F, by each entry of what else moves gaps.
-    """
-
-    felt: Float[np.ndarray, "modes size"]
-    ends: Float[np.ndarray, "modes 2 motion"]
-    widths: Float[np.ndarray, " modes"]
-    apart: Float[np.ndarray, "modes size"]
-    lost: Float[np.ndarray, "size modes"]
-    longest: int = slope.LONGEST
+    felt: Float[np.ndarray, "modes size"]  # F, by a change
+    ends: Float[np.ndarray, "modes 2 motion"]  # both motions after the step
+    widths: Float[np.ndarray, " modes"]  # how far apart each pair began
+    apart: Float[np.ndarray, "modes size"]  # D after the step
+    lost: Float[np.ndarray, "size modes"]  # small differences along the displacements that events replace
+    longest: int = slope.LONGEST  # after how many steps these pairs are let go in any case
+    # F, by each entry of what else moves gaps.
     by_others: dict[str, Float[np.ndarray, "modes entries"]] = field(default_factory=dict)
 
     def parted(self, count: int) -> tuple["Begun", "Begun"]:
-        """Return the first ones, and the others."""
-
         def of(part: slice) -> "Begun":
             arrays = {name: getattr(self, name)[part] for name in ("felt", "ends", "widths", "apart")}
             others = {name: share[part] for name, share in self.by_others.items()}
@@ -122,26 +135,10 @@ class Course:
 
 
 def fly(
-    flight: Flight,
-    course: Course,
-    layout: Layout,
-    lengths: Float[np.ndarray, " nv"],
-    timestep: float,
-    step: Callable[[np.ndarray, list[mujoco.MjModel]], np.ndarray],
-    found: Mapping[str, np.ndarray],
+    flight: Flight, course: Course, layout: Layout, scale: np.ndarray, step: _Step, found: Mapping[str, np.ndarray]
 ) -> None:
-    """Take pairs through all steps of a course, and write what the recursion needs.
-
-    Args:
-        flight: pairs in flight before; it is left as it is after the last step.
-        course: the motions that it is beside.
-        layout: places in states.
-        lengths: how far each velocity moves the farthest point of its bodies.
-        timestep: h (s).
-        step: function from states and models to the states after a step.
-        found: "felt", "slot", "apart" and "stays" with axes of motions and steps; "before" and "enters", without steps.
-    """
-    scale = np.concatenate([lengths, slope.TRAVEL * timestep * lengths, np.zeros(layout.num_rest)])
+    """Take pairs in flight through all steps of a course, and write what the recursion needs, see `advance`."""
+    # The scale makes changes lengths. What is found has axes of motions and, but for "before" and "enters", of steps.
     steps = course.rows.shape[1]
     by_step: dict[int, list[int]] = {}
     for motion, t in course.begun:
@@ -191,7 +188,7 @@ def fly(
 
 
 def _advance(
-    flight: Flight, live: np.ndarray, course: Course, t: int, layout: Layout, scale: np.ndarray, step: Callable
+    flight: Flight, live: np.ndarray, course: Course, t: int, layout: Layout, scale: np.ndarray, step: _Step
 ) -> None:
     """Take both motions of each pair through a step, and see whether derivatives say how they differ."""
     motions, slots = np.nonzero(live)

@@ -1,29 +1,29 @@
 r"""The derivative of a step of C MuJoCo from its solution.
 
 A step solves R(q, v, a; ...) = 0 for the mean acceleration a = (v' - v)/h, with R inverse dynamics less what acts: inertia, bias,
-passive forces, constraints (contacts, limits, friction), less actuators and applied forces. R is an explicit function, so
+passive forces, constraints, less actuators and applied forces. R is an explicit function, so
 
     ∂a/∂x = -(∂R/∂a)⁻¹ ∂R/∂x,     v' = v + h a,     q' = q ⊕ h v',
 
 and no difference contains an iteration of a solver: nothing that its tolerance leaves is divided by a width. `mj_inverse` with
-`mjENBL_INVDISCRETE` is R for all integrators but Runge-Kutta. Differences by velocities, accelerations, activations and controls
-need no kinematics and no collisions.
+`mjENBL_INVDISCRETE` is R for all integrators but Runge-Kutta. Only differences by positions need kinematics and collisions.
 
-- **Width.** R is as exact as rounding, so positions move by 2⁻³⁰ (m or rad) to one side. Centred differences of 1e-6 are as far
-  off (1e-6 of the largest entry on legged robots), and meet a thousand times as many surfaces. Without constraints they move by
-  2⁻²² to both sides. Shapes whose contacts are found by iterations, to 1e-6, are moved by 1e-6 to both sides.
+- **Width.** R is as exact as rounding, so positions move by 2⁻³⁰ (m or rad) to one side: wider differences meet more surfaces.
+  Without constraints they move by 2⁻²² to both sides, and by 1e-6 where contacts are found by iterations, to 1e-6.
 - **Actuators.** Each force depends on the actuator's own length, velocity, control and activations, so all are changed at once,
   and the moment arms carry the result. Where the integrator's matrix depends on controls (muscles, gains by velocity), where
   joints or tendons limit forces, or actuators are coupled, each is changed alone, and R is taken anew.
 - **What has no R**: Runge-Kutta, noslip, delays, plugins, and steps whose residual is not zero. `engines.jacobians` then takes
   whole steps.
 
-`mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by
-up to a quarter there.
+`mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by up
+to a quarter there.
 
 References:
     Todorov. Convex and analytically-invertible dynamics with contacts and constraints. ICRA 2014.
 """
+
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -50,6 +50,7 @@ _IMPLICIT = tuple(
     for name in ("IMPLICIT", "IMPLICITFAST", "DISCRETE")
     if hasattr(mujoco.mjtIntegrator, f"mjINT_{name}")
 )
+_Found = dict[str, np.ndarray]
 _BY_POTENTIAL = getattr(mujoco.mjtEnableBit, "mjENBL_IPC", 0)
 
 
@@ -113,35 +114,22 @@ class Inverse:
         return found
 
     def applied(self) -> Float[np.ndarray, " nv"]:
-        """Return applied forces at the position in `data`."""
         data, found = self.data, self.data.qfrc_applied.copy()
         for body in np.flatnonzero(data.xfrc_applied.any(axis=1)).tolist() if self.is_pulled else ():
             force, torque = np.split(data.xfrc_applied[body], 2)
             mujoco.mj_applyFT(self.model, data, force, torque, data.xipos[body], body, found)
         return found
 
-    def blocks(self, row: np.ndarray, acceleration: np.ndarray, found: dict[str, np.ndarray]) -> bool:
-        """Write the derivatives of R, inputs first, at a state and its acceleration; return whether R is zero there.
-
-        Args:
-            row: the state.
-            acceleration: a of the step from there.
-            found: "qpos", "qvel", "qacc" of R; "act" and "ctrl", where there are such, of R and, as "next ...", of activations.
-        """
+    def blocks(self, row: np.ndarray, acceleration: np.ndarray, found: _Found) -> bool:
+        """Write the derivatives of R, inputs first, at a state and its acceleration; return whether R is zero there."""
+        # They are "qpos", "qvel", "qacc" of R; "act" and "ctrl", where there are such, of R and, as "next ...", of activations.
         model, data = self.model, self.data
         self._set(row, acceleration)
         self._by_position(found["qpos"])
         # Friction by elliptic cones is curved: there both sides are needed.
-        is_curved = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and data.ncon
-        for name, width, before in (("qvel", _SPEED, 1), ("qacc", _PUSH, 2)):
-            arguments: list[np.ndarray | None] = [None] * 7
-            arguments[before] = found[name]
-            mujoco.mjd_inverseFD(model, data, width, True, *arguments)
-            if is_curved:
-                arguments[before] = other = np.empty_like(found[name])
-                mujoco.mjd_inverseFD(model, data, -width, True, *arguments)
-                found[name] += other
-                found[name] *= 0.5
+        is_curved = bool(model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and data.ncon)
+        self._difference(found["qvel"], 1, _SPEED, on_both_sides=is_curved)
+        self._difference(found["qacc"], 2, _PUSH, on_both_sides=is_curved)
         # The last difference moved accelerations alone.
         self.qacc[:] = acceleration
         at = self.residual(_VELOCITY)
@@ -154,6 +142,17 @@ class Inverse:
         off, forces = at - self.applied(), (data.qfrc_bias, data.qfrc_constraint, data.qfrc_inverse)
         return bool(off @ off <= _RESIDUAL**2 * max(sum(one @ one for one in forces), _TINY))
 
+    def _difference(self, found: np.ndarray, place: int, width: float, *, on_both_sides: bool) -> None:
+        """Write a difference by positions, velocities or accelerations: that of this place among `mjd_inverseFD`'s."""
+        arguments: list[np.ndarray | None] = [None] * 7
+        arguments[place] = found
+        mujoco.mjd_inverseFD(self.model, self.data, width, True, *arguments)
+        if on_both_sides:
+            arguments[place] = other = np.empty_like(found)
+            mujoco.mjd_inverseFD(self.model, self.data, -width, True, *arguments)
+            found += other
+            found *= 0.5
+
     def _by_position(self, found: np.ndarray) -> None:
         """Write differences by positions, with those geoms alone that touch: no others come to touch within a width."""
         model, data = self.model, self.data
@@ -165,41 +164,52 @@ class Inverse:
                     touching[geoms if owners is None else owners[geoms]] = 1
             for one, before, touching in zip(self.filters, self.filtered, 2 * self.touching, strict=True):
                 np.multiply(before, touching, out=one)
-        if data.nefc and not (geoms is not None and self._is_iterative(geoms)):
-            mujoco.mjd_inverseFD(model, data, _NARROW, True, found, *[None] * 6)
-        else:
-            width = _WIDTH if data.nefc else _FREE
-            mujoco.mjd_inverseFD(model, data, width, True, found, *[None] * 6)
-            mujoco.mjd_inverseFD(model, data, -width, True, other := np.empty_like(found), *[None] * 6)
-            found += other
-            found *= 0.5
+        is_searched = self.has_iterated and geoms is not None
+        is_searched = is_searched and (self.is_iterated[geoms].any(axis=1) & ~self.is_plane[geoms].any(axis=1)).any()
+        width = _FREE if not data.nefc else _WIDTH if is_searched else _NARROW
+        self._difference(found, 0, width, on_both_sides=width != _NARROW)
         for one, before in zip(self.filters, self.filtered, strict=True):
             one[:] = before
 
-    def _is_iterative(self, geoms: np.ndarray) -> bool:
-        """Return whether some pair of geoms has a contact that is found by iterations."""
-        return self.has_iterated and bool(
-            (self.is_iterated[geoms].any(axis=1) & ~self.is_plane[geoms].any(axis=1)).any()
-        )
-
     def _by_applied(self, found: np.ndarray) -> None:
         """Take what positions change of forces that are applied to bodies."""
-        model, data = self.model, self.data
-        for dof in range(model.nv):
-            ends = []
-            for side in (_WIDTH, -_WIDTH):
-                before = self.qpos.copy()
-                mujoco.mj_integratePos(model, self.qpos, side * np.eye(1, model.nv, dof)[0], 1.0)
-                mujoco.mj_kinematics(model, data)
-                mujoco.mj_comPos(model, data)
-                ends.append(self.applied())
-                self.qpos[:] = before
-            found[dof] -= (ends[0] - ends[1]) / (2 * _WIDTH)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
+
+        def at() -> np.ndarray:
+            mujoco.mj_kinematics(self.model, self.data)
+            mujoco.mj_comPos(self.model, self.data)
+            return self.applied()
+
+        for dof in range(self.model.nv):
+            found[dof] -= self._by_turn(dof, at)
+        at()
+
+    def _by_turn(self, dof: int, at: Callable[[], np.ndarray]) -> np.ndarray:
+        before, ends = self.qpos.copy(), []
+        for side in (_WIDTH, -_WIDTH):
+            mujoco.mj_integratePos(self.model, self.qpos, side * np.eye(1, self.model.nv, dof)[0], 1.0)
+            ends.append(at())
+            self.qpos[:] = before
+        return (ends[0] - ends[1]) / (2 * _WIDTH)
+
+    def _apart(
+        self, entry: np.ndarray, index: np.ndarray | slice, at: Callable[[], tuple[np.ndarray, ...]]
+    ) -> tuple[np.ndarray, ...]:
+        """Return how far apart what is found on both sides of some entries is, and how far apart the entries are."""
+        kept, ends = entry[index].copy(), []
+        if entry is self.ctrl:
+            up, down, width = self.sides(kept, _WIDTH, index)
+        else:
+            up, down, width = kept + _WIDTH, kept - _WIDTH, np.full(len(kept), 2 * _WIDTH)
+        for value in (up, down):
+            entry[index] = value
+            ends.append(at())
+        entry[index] = kept
+        return *(one - other for one, other in zip(*ends, strict=True)), width
 
     def _next(self) -> np.ndarray:
         """Return the activations after the step, and leave the state as it was."""
+        if not self.model.na:
+            return self.act.copy()
         kept = [one.copy() for one in (self.qpos, self.qvel, self.act)]
         mujoco.mj_Euler(self.model, self.data)
         end = self.act.copy()
@@ -217,15 +227,13 @@ class Inverse:
         """Return R and the next activations at a state and an acceleration."""
         self._set(row, acceleration)
         found = self.residual() - self.applied()
-        return found, self._next() if self.model.na else self.act.copy()
+        return found, self._next()
 
     def solutions(
         self, row: np.ndarray, acceleration: np.ndarray, matrix: np.ndarray, places: Float[np.ndarray, "places nq"]
     ) -> Float[np.ndarray, "places nv"]:
-        """Return the accelerations that solve R = 0 at other positions, by Newton's method with the derivative at hand.
-
-        Two steps: the first follows the geometry, the second takes what forces then have beyond their linear change.
-        """
+        """Return the accelerations that solve R = 0 at other positions, by Newton's method with the derivative at hand."""
+        # Two steps: the first follows the geometry, the second takes what forces then have beyond their linear change.
         found = []
         inverse = np.linalg.inv(matrix.T)
         self._set(row, acceleration)
@@ -236,100 +244,61 @@ class Inverse:
             found.append(self.qacc.copy())
         return np.array(found)
 
-    def _all_at_once(self, found: dict[str, np.ndarray]) -> None:
+    def _all_at_once(self, found: _Found) -> None:
         model, data = self.model, self.data
         mujoco.mju_sparse2dense(
             self.moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
         )
 
-        def changes(
-            entry: np.ndarray, index: np.ndarray, *, is_ctrl: bool = False
-        ) -> tuple[np.ndarray, np.ndarray | None]:
+        def forces() -> tuple[np.ndarray, np.ndarray]:
+            mujoco.mj_fwdActuation(model, data)
+            return data.actuator_force.copy(), self._next()
+
+        def changes(entry: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """Return the derivatives of forces and of next activations, each by its own actuator's entry."""
-            kept, ends = entry[index].copy(), []
-            if is_ctrl:
-                up, down, width = self.sides(kept, _WIDTH, index)
-            else:
-                up, down, width = kept + _WIDTH, kept - _WIDTH, np.full(len(kept), 2 * _WIDTH)
-            for value in (up, down):
-                entry[index] = value
-                mujoco.mj_fwdActuation(model, data)
-                ends.append((data.actuator_force.copy(), self._next() if model.na else None))
-            entry[index] = kept
-            by_force = np.zeros(model.nu)
+            force, following, width = self._apart(entry, index, forces)
             owner = self.of_act[index] if entry is self.act else index
-            by_force[owner] = (ends[0][0] - ends[1][0])[owner] / width
-            if not model.na:
-                return by_force, None
-            per_act = np.zeros(model.nu)
-            per_act[owner] = width
+            by_force, per_act = np.zeros((2, model.nu))
+            by_force[owner], per_act[owner] = force[owner] / width, width
             own = per_act[self.of_act]
-            return by_force, np.where(own > 0, (ends[0][1] - ends[1][1]) / np.maximum(own, _TINY), 0.0)
+            return by_force, np.where(own > 0, following / np.maximum(own, _TINY), 0.0)
 
         every = np.arange(model.nu)
-        by_force, of_next = changes(self.ctrl, every, is_ctrl=True)
+        by_force, of_next = changes(self.ctrl, every)
         found["ctrl"][:] = -by_force[:, None] * self.moment
-        if of_next is None:
+        if not model.na:
             return
-        acts = np.arange(model.na)
         found["next ctrl"][:] = 0.0
-        found["next ctrl"][self.of_act, acts] = of_next
+        found["next ctrl"][self.of_act, np.arange(model.na)] = of_next
         found["act"][:] = found["next act"][:] = 0.0
         for number in range(self.order.max() + 1):
             chosen = np.flatnonzero(self.order == number)
             by_force, of_next = changes(self.act, chosen)
-            assert of_next is not None
             found["act"][chosen] = -by_force[self.of_act[chosen], None] * self.moment[self.of_act[chosen]]
             for one in chosen:
                 own = np.flatnonzero(self.of_act == self.of_act[one])
                 found["next act"][one, own] = of_next[own]
         for name, entry in (("qpos", data.actuator_length), ("qvel", data.actuator_velocity)):
             _, of_next = changes(entry, every)
-            assert of_next is not None
             found[f"next {name}"][:] = (of_next[:, None] * self.moment[self.of_act]).T
 
-    def _one_by_one(self, found: dict[str, np.ndarray]) -> None:
-        model = self.model
-
-        def evaluated() -> tuple[np.ndarray, np.ndarray]:
-            force = self.residual(_VELOCITY)
-            return force, self._next() if model.na else np.zeros(0)
-
+    def _one_by_one(self, found: _Found) -> None:
         for name, entry in (("ctrl", self.ctrl), ("act", self.act)):
             for k in range(len(entry)):
-                own, ends = slice(k, k + 1), []
-                kept = entry[own].copy()
-                is_ctrl = name == "ctrl"
-                up, down, width = (
-                    self.sides(kept, _WIDTH, own) if is_ctrl else (kept + _WIDTH, kept - _WIDTH, 2 * _WIDTH)
-                )
-                for value in (up, down):
-                    entry[own] = value
-                    ends.append(evaluated())
-                entry[own] = kept
-                found[name][k] = (ends[0][0] - ends[1][0]) / width
-                if model.na:
-                    found[f"next {name}"][k] = (ends[0][1] - ends[1][1]) / width
-        if model.na:
-            self._activations_by_motion(found)
+                both = self._apart(entry, slice(k, k + 1), lambda: (self.residual(_VELOCITY), self._next()))
+                found[name][k], found[f"next {name}"][k] = both[0] / both[2], both[1] / both[2]
+        if not self.model.na:
+            return
 
-    def _activations_by_motion(self, found: dict[str, np.ndarray]) -> None:
-        """Write the derivatives of next activations by position and velocity, of coupled actuators, too."""
-        model, data = self.model, self.data
-        for name in ("qpos", "qvel"):
-            for dof in range(model.nv):
-                ends = []
-                for side in (_WIDTH, -_WIDTH):
-                    kept = self.qpos.copy(), self.qvel.copy()
-                    if name == "qpos":
-                        mujoco.mj_integratePos(model, self.qpos, side * np.eye(1, model.nv, dof)[0], 1.0)
-                    else:
-                        self.qvel[dof] += side
-                    mujoco.mj_inverse(model, data)
-                    mujoco.mj_fwdActuation(model, data)
-                    ends.append(self._next())
-                    self.qpos[:], self.qvel[:] = kept
-                found[f"next {name}"][dof] = (ends[0] - ends[1]) / (2 * _WIDTH)
+        def following() -> np.ndarray:
+            mujoco.mj_inverse(self.model, self.data)
+            mujoco.mj_fwdActuation(self.model, self.data)
+            return self._next()
+
+        for dof in range(self.model.nv):
+            found["next qpos"][dof] = self._by_turn(dof, following)
+            change, width = self._apart(self.qvel, slice(dof, dof + 1), lambda: (following(),))
+            found["next qvel"][dof] = change / width
 
 
 def shapes(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
@@ -340,21 +309,10 @@ def shapes(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
 
 
 def step_of(
-    layout: Layout,
-    timestep: float,
-    speeds: Float[np.ndarray, "rows nv"],
-    found: dict[str, np.ndarray],
-    names: list[str],
-) -> dict[str, np.ndarray]:
-    """Return the derivatives of steps by "state" and by what else is named, from those of R, inputs first.
-
-    Args:
-        layout: the model's.
-        timestep: h.
-        speeds: velocities after the steps.
-        found: "qpos", "qvel", "qacc" and "act" of R, and of each name, with "next" of activations where the model has any.
-        names: other inputs, and numbers.
-    """
+    layout: Layout, timestep: float, speeds: Float[np.ndarray, "rows nv"], found: _Found, names: list[str]
+) -> _Found:
+    """Return the derivatives of steps by "state" and by names of other inputs and numbers, from those of R, inputs first."""
+    # Speeds are those after the steps. What is found is as of `Inverse.blocks`, and of each name, with "next" of activations.
     nv, na = layout.nv, found["act"].shape[-2]
     every = ["qpos", "qvel", "act", *names]
     sizes = [found[name].shape[-2] for name in every]

@@ -17,10 +17,9 @@ from jaxtyping import Bool, Float
 from mjxgrad._warnings import give_up_if_stopped
 from mjxgrad.engines import inverse
 from mjxgrad.engines.events import HAIR, Events, Near, Surfaces, clearance, undecided
-from mjxgrad.engines.flight import Begun
+from mjxgrad.engines.flight import FIRST, PAIRS, Begun
 from mjxgrad.engines.inverse import Inverse
 from mjxgrad.engines.layout import EVERY, INPUTS, Layout
-from mjxgrad.engines.stepmap import FIRST, PAIRS
 from mjxgrad.engines.steps import Stepper
 from mjxgrad.stepping import slope
 
@@ -60,55 +59,33 @@ def solved(model: mujoco.MjModel) -> mujoco.MjModel:
 
 @dataclass
 class Steps:
-    """Steps to be differentiated, and what is found of them.
+    """Steps to be differentiated, and what is found of them."""
 
-    Attributes:
-        rows: whole states of MuJoCo before each.
-        models: one of each, shared where they are the same.
-        speeds: velocities that the motions of each model reach.
-        gradient: "discrete" or "slope".
-        found: arrays to be written, by name, with one entry per row.
-        begun: pairs that begin, by row.
-        chosen: other models than given, where rounding decides if a contact acts.
-        is_finite: whether a step ends in numbers.
-    """
-
-    rows: Float[np.ndarray, "rows size"]
-    models: list[mujoco.MjModel]
-    speeds: Mapping[int, Float[np.ndarray, "some nv"]]
-    gradient: str
-    found: _Found
-    is_finite: Bool[np.ndarray, " rows"]
-    begun: dict[int, Begun] = field(default_factory=dict)
+    rows: Float[np.ndarray, "rows size"]  # whole states of MuJoCo before each
+    models: list[mujoco.MjModel]  # one of each, shared where they are the same
+    speeds: Mapping[int, Float[np.ndarray, "some nv"]]  # velocities that the motions of each model reach
+    gradient: str  # "discrete" or "slope"
+    found: _Found  # arrays to be written, by name, with one entry per row
+    is_finite: Bool[np.ndarray, " rows"]  # whether a step ends in numbers
+    begun: dict[int, Begun] = field(default_factory=dict)  # pairs that begin, by row
+    # Other models than given, where rounding decides if a contact acts.
     chosen: dict[int, mujoco.MjModel] = field(default_factory=dict)
 
 
 @dataclass
 class _Row:
-    """A step of which derivatives are taken: its state, its end and acceleration, and where they are taken.
+    """A step of which derivatives are taken: its state, its end and acceleration, and where they are taken."""
 
-    Attributes:
-        before, after: whole states before and after the step.
-        found: its part of what is to be written.
-        raw: derivatives of R, inputs first.
-        by: inverse dynamics, also of another model where rounding decides.
-        clear: the state about which no small difference crosses a surface.
-        near: surfaces near the state.
-        acceleration: the step's from there.
-        begun: pairs of motions that its events begin.
-        is_explicit: whether R has all that the step does.
-    """
-
-    before: Float[np.ndarray, " size"]
-    after: Float[np.ndarray, " size"]
-    found: _Found
-    raw: _Found
-    by: Inverse
-    clear: Float[np.ndarray, " size"]
-    acceleration: Float[np.ndarray, " nv"]
-    near: Near | None = None
-    begun: Begun | None = None
-    is_explicit: bool = False
+    before: Float[np.ndarray, " size"]  # whole states before and after the step
+    after: Float[np.ndarray, " size"]  # whole states before and after the step
+    found: _Found  # its part of what is to be written
+    raw: _Found  # derivatives of R, inputs first
+    by: Inverse  # inverse dynamics, also of another model where rounding decides
+    clear: Float[np.ndarray, " size"]  # the state about which no small difference crosses a surface
+    acceleration: Float[np.ndarray, " nv"]  # the step's from there
+    near: Near | None = None  # surfaces near the state
+    begun: Begun | None = None  # pairs of motions that its events begin
+    is_explicit: bool = False  # whether R has all that the step does
 
     @property
     def events(self) -> Events | None:
@@ -141,10 +118,8 @@ class Worker:
 
     @np.errstate(invalid="ignore", over="ignore")
     def differences(self, model: mujoco.MjModel, row: np.ndarray, found: _Found, num_steps: int) -> bool:
-        """Write the end of a motion and its differences by state and held controls, all in C; return whether they are right.
-
-        `mjd_transitionFD` is not where forces by controls change the integrator's matrix, and at surfaces, where it is steep.
-        """
+        """Write the end of a motion and its differences by state and held controls, all in C; return whether they are right."""
+        # `mjd_transitionFD` is not where forces by controls change the integrator's matrix, and at surfaces, where it is steep.
         self._use(model, np.zeros((0, self.layout.nv)), "discrete")
         if self.inverse.is_coupled or not self.is_explicit:
             return False
@@ -159,12 +134,9 @@ class Worker:
             matrix = by_state @ matrix
             matrix[:, size:] += by_control
         mujoco.mj_getState(self.model, data, end := np.empty_like(row), EVERY)
-        found["state"][:], found["ctrl"][:], found["end"][:] = (
-            matrix[:, :size],
-            matrix[:, size:],
-            end[self.layout.motion],
-        )
-        return bool(np.isfinite(end).all() and self._steepness(A) <= _STEEP / self.model.opt.timestep)
+        found["state"][:], found["ctrl"][:] = np.split(matrix, [size], axis=1)
+        found["end"][:] = end[self.layout.motion]
+        return bool(np.isfinite(end).all()) and not self._is_steep(A)
 
     def _together(self, steps: Steps, index: list[int]) -> None:
         """Write the derivatives of rows of one model: differences one by one, the algebra at once."""
@@ -179,7 +151,7 @@ class Worker:
         explicit = [(k, one) for k, _, one in done if one.is_explicit]
         self._assemble(raw, explicit, names)
         for _, i, one in done:
-            if one.is_explicit and self._is_steep(one):
+            if one.is_explicit and self._is_steep(one.found["state"]):
                 self._beside(steps.gradient, one, names)
             self._with_events(one)
             if one.begun is not None:
@@ -188,7 +160,6 @@ class Worker:
                 steps.chosen[i] = one.by.model
 
     def _memory(self, steps: Steps, names: list[str], count: int) -> _Found:
-        """Return room for the derivatives of R."""
         shapes = inverse.shapes(self.model)
         for name in names[1:]:
             columns = steps.found[name].shape[-1]
@@ -199,7 +170,6 @@ class Worker:
         return raw
 
     def _assemble(self, raw: _Found, rows: list[tuple[int, _Row]], names: list[str]) -> None:
-        """Write the derivatives of steps from those of R."""
         if not rows:
             return
         chosen = [k for k, _ in rows]
@@ -244,7 +214,7 @@ class Worker:
         shift = clearance(small, events.surfaces, events.gaps, events.centres)
         if shift.any():
             self._move(one, shift)
-        if self.surfaces.lead:
+        if self.surfaces.has_stages:
             for move, rates in zip(events.moves.T, events.rows, strict=True):
                 one.clear = self._off_stages(one, WIDTH * np.abs(rates).max() * move)
 
@@ -257,10 +227,6 @@ class Worker:
         if shift is not None:
             self._move(one, shift)
 
-    def _is_steep(self, one: _Row) -> bool:
-        """Return whether differences are steeper than any contact, so that they step over a jump."""
-        return not self._steepness(one.found["state"]) <= _STEEP / self.model.opt.timestep
-
     def _beside(self, gradient: str, one: _Row, names: list[str]) -> None:
         """Differentiate a step anew whose differences are too steep: from beside, and at last by whole steps."""
         if gradient == "discrete":
@@ -271,7 +237,7 @@ class Worker:
                     value[:] = 0.0
                 self._differentiate(one, names)
                 self._assemble(raw, [(0, one)] * one.is_explicit, names)
-        if one.is_explicit and self._is_steep(one):
+        if one.is_explicit and self._is_steep(one.found["state"]):
             kept = {name: one.found[name].copy() for name in ("state", "ctrl") if name in one.found}
             self._by_steps(one)
             if not self._steepness(one.found["state"]) < 0.5 * self._steepness(kept["state"]):
@@ -286,7 +252,6 @@ class Worker:
         one.by = min(self.others, key=lambda by: np.abs(self._step(by, one.before)[speed] - one.after[speed]).max())
 
     def _move(self, one: _Row, shift: Float[np.ndarray, " nv"]) -> None:
-        """Take derivatives of a step from a little beside."""
         one.clear = self.layout.moved(one.before, shift)
         one.acceleration = self._acceleration(one.clear, self._step(one.by, one.clear))
 
@@ -304,7 +269,7 @@ class Worker:
         felt = np.pad(np.hstack([events.rows, events.ahead]), ((0, 0), (0, layout.num_rest)))
         apart = layout.difference(ends[:, 0], ends[:, 1]) / (2 * widths)[:, None]
         begun = Begun(felt, ends[..., layout.motion], 2 * widths, apart, np.zeros_like(apart).T)
-        begun.longest = slope.LONGEST_OF_STAGES if self.surfaces.lead else slope.LONGEST
+        begun.longest = slope.LONGEST_OF_STAGES if self.surfaces.has_stages else slope.LONGEST
         return begun
 
     def _differentiate(self, one: _Row, names: list[str]) -> None:
@@ -326,7 +291,7 @@ class Worker:
             lost = matrix[:, :nv] @ events.moves
             matrix[:, nv : 2 * nv] -= lost @ events.ahead
             one.begun.lost = lost
-        if one.near.is_rough:
+        if len(one.near.rough):
             by_rest = matrix[:, :nv] @ rest
             self._visibly(one, rest, by_rest)
             matrix[:, :nv] = by_rest
@@ -364,7 +329,7 @@ class Worker:
 
     def _by_steps(self, one: _Row) -> None:
         """Write differences of whole steps by state and controls."""
-        width = WIDTH if one.near is None or not one.near.is_rough or self.surfaces.lead else _RUBBING
+        width = WIDTH if one.near is None or not len(one.near.rough) or self.surfaces.has_stages else _RUBBING
         layout = self.layout
         one.found["state"][:] = self._smooth(one, np.eye(layout.num_changes), width).T
         if "ctrl" in one.found:
@@ -376,18 +341,12 @@ class Worker:
             one.found["ctrl"][:] = self._between(one, starts, size).T
 
     def _smooth(self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float) -> np.ndarray:
-        """Return differences along directions, over one side where the other has a jump, and narrower where both have.
-
-        A stage of Runge-Kutta may meet a surface that the start is far from.
-        """
+        """Return differences along directions, over one side where the other has a jump, and narrower where both have."""
+        # A stage of Runge-Kutta may meet a surface that the start is far from.
         is_own = one.clear is one.before and one.by is self.inverse
         middle = one.after if is_own else self._step(one.by, one.clear)
-        found, sizes, had_jump = (
-            np.zeros_like(directions),
-            np.full(len(directions), np.inf),
-            np.zeros(len(directions), bool),
-        )
-        left, signs = np.arange(len(directions)), np.array([1.0, -1.0])
+        found, sizes = np.zeros_like(directions), np.full(len(directions), np.inf)
+        left, had_jump, signs = np.arange(len(sizes)), np.zeros(len(sizes), bool), np.array([1.0, -1.0])
         for narrower in (1.0, _NARROWER, _NARROWER**2):
             starts = self.layout.moved(one.clear, narrower * width * signs[:, None] * directions[left, None])
             ends = self._steps(one.by, starts)
@@ -406,15 +365,12 @@ class Worker:
         return found
 
     def _between(self, one: _Row, starts: Float[np.ndarray, "columns 2 size"], widths: np.ndarray) -> np.ndarray:
-        """Return differences of the ends of steps over their widths, a row each."""
         ends = self._steps(one.by, starts)
         return self.layout.difference(ends[:, 0], ends[:, 1]) / widths[:, None]
 
     def _off_stages(self, one: _Row, change: Float[np.ndarray, " nv"]) -> np.ndarray:
-        """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike.
-
-        Accelerations move the stages, so that their places are not known beforehand.
-        """
+        """Return a state near which no stage of Runge-Kutta meets a surface: there differences of any width are alike."""
+        # Accelerations move the stages, so that their places are not known beforehand.
         row, layout = one.clear, self.layout
         for _ in range(4):
             sizes = np.array([1.0, 4.0])
@@ -430,6 +386,10 @@ class Worker:
         lengths = self.surfaces.lengths
         nv = len(lengths)
         return np.abs(matrix[..., nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(initial=0.0)
+
+    def _is_steep(self, matrix: Float[np.ndarray, "... size size"]) -> bool:
+        """Return whether differences are steeper than any contact, so that they step over a jump."""
+        return not self._steepness(matrix) <= _STEEP / self.model.opt.timestep
 
     @np.errstate(invalid="ignore", over="ignore", divide="ignore")
     def sense(self, steps: Steps, index: list[int]) -> None:
@@ -452,10 +412,8 @@ class Worker:
         return data.sensordata.copy()
 
     def _by_sensors(self, row: np.ndarray, found: _Found) -> None:
-        """Write small differences of sensors by state, controls, other inputs and numbers.
-
-        `mjd_transitionFD` of MuJoCo 3.17, centred, gives those by controls the wrong sign.
-        """
+        """Write small differences of sensors by state, controls, other inputs and numbers."""
+        # `mjd_transitionFD` of MuJoCo 3.17, centred, gives those by controls the wrong sign.
         model, layout, place = self.inverse.model, self.layout, self.layout.places["ctrl"]
         self._read(row)
         # What needs fewer stages comes first, while those of the row are known.
@@ -512,14 +470,12 @@ class Worker:
     def _changes(
         self, by: Inverse, row: np.ndarray, name: str
     ) -> Iterator[tuple[Callable[[float], np.ndarray], float, bool]]:
-        """Give for each entry a function of an amount to the state that it changes so, a small amount, and whether it is zero.
-
-        Numbers of the model change here and where gaps are measured.
-        """
+        """Give for each entry a function of an amount to the state that it changes so, a small amount, and whether it is zero."""
+        # Numbers of the model change here and where gaps are measured.
         if name in INPUTS:
             place, size = self.layout.places[name], min(WIDTH, HAIR) if moves_gaps(name) else WIDTH
             for entry in range(place.start, place.stop):
-                yield functools.partial(_with_entry, row, entry), size, False
+                yield lambda amount, entry=entry: row + amount * np.eye(1, len(row), entry)[0], size, False
             return
         attribute, both = name.removeprefix("opt."), (by.model, self.surfaces.model)
         holders = [model.opt for model in both] if name.startswith("opt.") else both
@@ -540,12 +496,10 @@ class Worker:
         return events.weights @ change[events.index]
 
     def _steps(self, by: Inverse, starts: Float[np.ndarray, "columns 2 size"]) -> np.ndarray:
-        """Return the states after steps from both sides of each column."""
         rows = starts.reshape(-1, starts.shape[-1])
         return self.stepper(rows, [by.model] * len(rows)).reshape(starts.shape)
 
     def _step(self, by: Inverse, row: np.ndarray) -> np.ndarray:
-        """Return the state after a step."""
         mujoco.mj_setState(by.model, by.data, row, EVERY)
         mujoco.mj_step(by.model, by.data)
         mujoco.mj_getState(by.model, by.data, end := np.empty_like(row), EVERY)
@@ -553,10 +507,8 @@ class Worker:
 
 
 def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) -> np.ndarray:
-    """Return the derivative by an amount. A number that is zero may be a switch, which no small amount may turn on.
-
-    Where both sides differ, the amount's own side counts if half of the amount does half as much, and nothing if not.
-    """
+    """Return the derivative by an amount. A number that is zero may be a switch, which no small amount may turn on."""
+    # Where both sides differ, the amount's own side counts if half of the amount does half as much, and nothing if not.
 
     def at(amount: float) -> np.ndarray | None:
         try:
@@ -575,13 +527,6 @@ def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) 
         return 0.5 * (up + down)
     half = (end(size / 2) - middle) / (size / 2)
     return up if np.linalg.norm(half - up) <= _KINK * np.linalg.norm(up) else 0.0 * up
-
-
-def _with_entry(row: np.ndarray, entry: int, amount: float) -> np.ndarray:
-    """Return a state with an entry changed by an amount."""
-    row = row.copy()
-    row[entry] += amount
-    return row
 
 
 def _with_number(

@@ -4,6 +4,8 @@ A state that goes on has positions, velocities and the *rest*: activations, and 
 states of plugins. A change of it has as many numbers as there are velocities in place of positions.
 """
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -20,13 +22,7 @@ _SMALL = 1e-4  # rad, below which series replace quotients
 
 
 class Layout:
-    """The places of a model's states and changes.
-
-    Attributes:
-        places: slices of MuJoCo's vector of everything that a step depends on, by part.
-        sizes: numbers in each part of a motion.
-        num_changes: numbers of a change: of positions and velocities, and of the rest.
-    """
+    """The places of a model's states and changes: slices of MuJoCo's vector of everything that a step depends on, by part."""
 
     def __init__(self, model: mujoco.MjModel):
         names = ("time", *MOTION, "warmstart", *INPUTS)
@@ -85,23 +81,21 @@ class Layout:
 
     def carry(self, turned: Float[np.ndarray, "... nv"], values: Float[np.ndarray, "... nv columns"]) -> np.ndarray:
         """Return how changes of a position look after a turn: those of quaternions are seen from the turned body."""
-        if not self.turns.size:
-            return values
-        values = values.copy()
-        values[..., self.turns, :] = np.swapaxes(_matrix(turned[..., self.turns]), -1, -2) @ values[..., self.turns, :]
-        return values
+        return self._by_turns(turned, values, lambda turn: np.swapaxes(_matrix(turn), -1, -2))
 
     def follow(self, turned: Float[np.ndarray, "... nv"], values: Float[np.ndarray, "... nv columns"]) -> np.ndarray:
         """Return how changes of a turn change the position after it: the right Jacobian of the exponential map."""
+        return self._by_turns(turned, values, _right_jacobian)
+
+    def _by_turns(self, turned: np.ndarray, values: np.ndarray, matrix: Callable) -> np.ndarray:
         if not self.turns.size:
             return values
         values = values.copy()
-        values[..., self.turns, :] = _right_jacobian(turned[..., self.turns]) @ values[..., self.turns, :]
+        values[..., self.turns, :] = matrix(turned[..., self.turns]) @ values[..., self.turns, :]
         return values
 
 
 def _times(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return products of quaternions."""
     a, b, c, d = np.moveaxis(left, -1, 0)
     w, x, y, z = np.moveaxis(right, -1, 0)
     parts = (
@@ -142,7 +136,6 @@ def _coefficients(turn: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _matrix(turn: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices of turns."""
     (sine, cosine, _), skew = _coefficients(turn), _skew(turn)
     return np.eye(3) + sine * skew + cosine * skew @ skew
 

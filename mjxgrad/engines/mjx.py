@@ -3,12 +3,14 @@
 import dataclasses
 import functools
 import warnings
+import weakref
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from mjxgrad._mjx import mjx
@@ -16,13 +18,19 @@ from mjxgrad._programs import compiled, is_traced
 from mjxgrad.batched.cholesky import SOLUTION
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.contact.collision import first_missed, slot_geoms
-from mjxgrad.engines.agreement import parting
 from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows, one_each
-from mjxgrad.engines.state import State, Trajectory, data_of, direction, is_sound, state_of
+from mjxgrad.engines.layout import INPUTS
+from mjxgrad.engines.pool import pool_of
+from mjxgrad.engines.state import State, Trajectory, data_of, is_sound, state_of
 from mjxgrad.scene import Scene, SceneWarning
-from mjxgrad.scene.scene import numbers_of
+from mjxgrad.scene.scene import changed_numbers, numbers_of
 from mjxgrad.stepping import Contact, Discrete, Onset, OwnMotion, Slope, Smoothing, forward, pairs, step
 from mjxgrad.stepping.onset import reach
+
+_NUM_STEPS = 8
+_APART = 0.05  # of the largest change of a speed in a step; solvers of few iterations are off by some thousandths
+_SMALLEST = 1e-3  # of such a change (m/s or rad/s)
+_SEEN: weakref.WeakSet[mujoco.MjModel] = weakref.WeakSet()
 
 
 class MJX:
@@ -43,7 +51,7 @@ class MJX:
         is_known = not is_traced((motion, state, rows))
         found = (_roll_out_compiled if is_known and not has_functions else roll_out)(motion, state, rows)
         is_own = isinstance(motion.contact, OwnMotion) and is_known and not is_traced(found)
-        if is_own and (message := parting(motion.scene, found, rows.inputs)):
+        if is_own and (message := _parting(motion.scene, found, rows.inputs)):
             warnings.warn(f"{motion.scene.name}: {message}", SceneWarning, stacklevel=3)
         return found
 
@@ -121,20 +129,13 @@ class Moving(eqx.Module):
 
 
 class _Carry(NamedTuple):
-    """The carry of the scan: the last good state, what to count as in `Trajectory`, and a tangent that measures growth.
-
-    `before` is the previous control, under which a policy observes; None for a policy that sees the state. `watched` moves as
-    the state does; its tangent is followed, and nothing is differentiated by it.
-    """
+    """The carry of the scan: the last good state, and what to count as in `Trajectory`."""
 
     moving: Moving
-    before: Array | None
+    before: Array | None  # the previous control, under which a policy observes; None for a policy that sees the state
     first_bad: Array
     unsolved: Array
     crowded: Array
-    watched: Moving | None
-    tangent: tuple[Array, ...] | None
-    growth: Array | None
 
 
 class Scan(Motion):
@@ -146,18 +147,9 @@ class Scan(Motion):
         # A NaN in the contacts of a traced model would go unnoticed.
         traced = [x for x in numbers_of(self.scene.model).values() if isinstance(x, jax.core.Tracer)]
         has_numbers = ~jnp.any(jnp.stack([jnp.any(jnp.isnan(x)) for x in traced])) if traced else jnp.array(True)
+        first_bad, none = jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)), jnp.zeros((), jnp.int32)
         moving = Moving.at(self.scene, state, self.contact)
-        watched = jax.lax.stop_gradient(moving) if self.measure_growth else None
-        return _Carry(
-            moving,
-            self.scene.data.ctrl if looks else None,
-            jnp.where(has_numbers, jnp.int32(-1), jnp.int32(0)),
-            jnp.zeros((), jnp.int32),
-            jnp.zeros((), jnp.int32),
-            watched,
-            None if watched is None else (*direction(state), *_held(watched)),
-            None if watched is None else jnp.ones((), state.qvel.dtype),
-        )
+        return _Carry(moving, self.scene.data.ctrl if looks else None, first_bad, none, none)
 
     def advance(self, carry: _Carry, given: tuple[Array, Rows]) -> tuple[_Carry, tuple]:
         """Take one step, and return the next carry and the outputs of this step."""
@@ -174,48 +166,31 @@ class Scan(Motion):
         is_unsolved, is_crowded = self.troubles(stepped)
         is_bad = ~is_sound(*(getattr(moving.state, name) for name in ("qpos", "qvel", "act")))
         first_bad = jnp.where((carry.first_bad < 0) & is_bad, index, carry.first_bad)
-        watched, tangent, growth = self.measure(carry, data)
         following = _Carry(
             jax.tree.map(lambda old, new: jnp.where(first_bad >= 0, old, new), carry.moving, moving),
             None if carry.before is None else ctrl.astype(carry.before.dtype),
             first_bad,
             carry.unsolved + ((first_bad < 0) & is_unsolved),
             carry.crowded + ((first_bad < 0) & is_crowded),
-            watched,
-            tangent,
-            growth,
         )
         # A step's data has the derivative along the motion alone.
         observed = self.look(state, ctrl, forces, None if moving.flight is not None else stepped)
         return following, (state.qpos, state.qvel, state.act, ctrl, observed, seen)
 
     def step(self, moving: Moving, data: mjx.Data) -> tuple[Any, Moving]:
-        """Return what a step from data of this state found, and the next of these."""
         return moving.stepped(self.scene.model, data, self.contact)
 
     def troubles(self, stepped: Any) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
         """Return whether a step was not solved to the end, and whether contacts lacked room."""
-        model = self.scene.model
-        crowded = _is_crowded(model, jax.lax.stop_gradient(stepped), self.contact)
+        model, data = self.scene.model, jax.lax.stop_gradient(stepped)
+        if not data._impl.ncon or slot_geoms(model, data) is not None:
+            crowded = jnp.array(False)
+        elif isinstance(self.contact, Smoothing):
+            crowded = jnp.array(True)
+        else:
+            away = reach(model, data, self.contact) if isinstance(self.contact, Onset) else 0.0
+            crowded = first_missed(model, data) < away
         return stepped._impl.solver_niter > model.opt.iterations, crowded
-
-    def measure(self, carry: _Carry, data: mjx.Data) -> tuple[Moving | None, tuple | None, Array | None]:
-        """Return what is watched after a step from data, its tangent there, and the largest norm of that so far."""
-        if carry.watched is None or carry.tangent is None or carry.growth is None:
-            return None, None, None
-        model, data, watched = jax.lax.stop_gradient((self.scene.model, data, carry.watched))
-
-        def motion(qpos: Array, qvel: Array, *held: Array) -> tuple[tuple, Moving]:
-            flight = watched.flight if not held else eqx.tree_at(lambda x: x.held, watched.flight, held[0])
-            after = self.step(Moving(watched.state, flight), data.replace(qpos=qpos, qvel=qvel))[1]
-            seen = after.seen(model)
-            return ((after.state.qpos, after.state.qvel, *_held(after)), (seen.qpos, seen.qvel)), after
-
-        _, (change, whole), after = jax.jvp(
-            motion, (data.qpos, data.qvel, *_held(watched)), carry.tangent, has_aux=True
-        )
-        growth = jnp.maximum(carry.growth, jnp.linalg.norm(jnp.concatenate(whole)))  # a NaN stays one
-        return after, change, growth
 
     def look(self, state: State, ctrl: Array, forces: dict, stepped: Any = None) -> PyTree:
         """Return the observations in a state under a control, from the data of a step where it is given."""
@@ -230,10 +205,6 @@ class Scan(Motion):
         return self.observe(model, stepped.replace(**at_start))
 
 
-def _held(moving: Moving) -> tuple[Array, ...]:
-    return () if moving.flight is None else (moving.flight.held,)
-
-
 def roll_out(motion: Motion, state: State, rows: Rows, loop: type[Scan] = Scan) -> Trajectory:
     """Return the result of `rollout` by a loop."""
     scan = loop(**{field.name: getattr(motion, field.name) for field in dataclasses.fields(motion)})
@@ -244,7 +215,7 @@ def roll_out(motion: Motion, state: State, rows: Rows, loop: type[Scan] = Scan) 
         advance = jax.checkpoint(advance, policy=keep, prevent_cse=False)
     first, steps = scan.begin(state), jnp.arange(len(rows.controls), dtype=jnp.int32)
     end, (qpos, qvel, act, ctrl, observed, seen) = jax.lax.scan(advance, first, (steps, rows))
-    final, growth = end.moving.end(scan.scene.model, state), end.growth
+    final = end.moving.end(scan.scene.model, state)
     if scan.observe is not None:
         last = scan.look(final, ctrl[-1], jax.tree.map(lambda x: x[-1], rows.inputs))
         observed = jax.tree.map(lambda x, y: jnp.concatenate([x, jnp.asarray(y)[None]]), observed, last)
@@ -258,7 +229,6 @@ def roll_out(motion: Motion, state: State, rows: Rows, loop: type[Scan] = Scan) 
         first_bad_step=end.first_bad,
         unsolved=end.unsolved,
         crowded=end.crowded,
-        growth=None if growth is None else jnp.where(jnp.isnan(growth), jnp.inf, growth),
         act=jnp.concatenate([act, final.act[None]]),
         seen=seen,
     )
@@ -267,10 +237,31 @@ def roll_out(motion: Motion, state: State, rows: Rows, loop: type[Scan] = Scan) 
 _roll_out_compiled = compiled(roll_out)
 
 
-def _is_crowded(model: mjx.Model, data: mjx.Data, contact: Contact) -> Bool[Array, ""]:
-    """Return whether contacts may have acted without a slot in the step behind this data."""
-    if not data._impl.ncon or slot_geoms(model, data) is not None:
-        return jnp.array(False)
-    if isinstance(contact, Smoothing):
-        return jnp.array(True)
-    return first_missed(model, data) < (reach(model, data, contact) if isinstance(contact, Onset) else 0.0)
+def _parting(scene: Scene, found: Trajectory, inputs: dict[str, Array]) -> str | None:
+    """Say where steps of a known rollout by MJX are not C MuJoCo's; None where they are, or were looked at before."""
+    # To compile a step for the sake of a comparison takes up to a minute. The first rollout has some already.
+    last = len(found.ctrl) if found.first_bad_step < 0 else int(found.first_bad_step)
+    if scene.mj_model in _SEEN or not last:
+        return None
+    _SEEN.add(scene.mj_model)
+    steps = np.unique(np.linspace(0, last - 1, _NUM_STEPS).astype(int))
+    starts = {name: np.asarray(getattr(found, name))[steps] for name in ("qpos", "qvel", "act")}
+    given = {name: np.asarray(getattr(scene.data, name)) for name in INPUTS[1:]}
+    given = {name: np.broadcast_to(value, (len(steps), *value.shape)) for name, value in given.items()}
+    given |= {name: np.asarray(value)[steps] for name, value in inputs.items()}
+    given = {name: value[:, None] for name, value in given.items() if value.size}
+    given["ctrl"] = np.asarray(found.ctrl)[steps][:, None]
+    numbers = {name: np.asarray(value)[None] for name, value in changed_numbers(scene).items()}
+    after = pool_of(scene.mj_model).run(numbers, {"time": np.zeros((len(steps), 1)), **starts}, given)["qvel"][:, 0]
+    ours = np.asarray(found.qvel)[steps + 1]
+    off = np.abs(ours - after) / np.maximum(np.abs(after - starts["qvel"]).max(axis=1, keepdims=True), _SMALLEST)
+    place, dof = np.unravel_index(off.argmax(), off.shape)
+    if not off[place, dof] > _APART:
+        return None
+    joint = scene.mj_model.dof_jntid[dof]
+    name = scene.mj_model.joint(joint).name or f"joint {joint}"
+    single = " or take double precision, if rounding decides what touches" if ours.dtype == np.float32 else ""
+    return (
+        f"step {steps[place]} by MJX is not C MuJoCo's: {name} has a speed of {ours[place, dof]:.4g} after it, by C MuJoCo "
+        f"{after[place, dof]:.4g}; load it with engine='mujoco'{single}"
+    )

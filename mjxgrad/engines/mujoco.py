@@ -1,14 +1,14 @@
 """C MuJoCo: on all cores of the processor, without compilation, differentiable once; any scene that MuJoCo loads."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._arrays import is_known
 from mjxgrad._mjx import mjx
@@ -17,7 +17,7 @@ from mjxgrad.engines import rule
 from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows, one_each
 from mjxgrad.engines.layout import INPUTS, MOTION
 from mjxgrad.engines.pool import pool_of
-from mjxgrad.engines.state import Pairs, State, Trajectory, data_of, direction, is_sound
+from mjxgrad.engines.state import Pairs, State, Trajectory, data_of, is_sound
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Contact, Discrete, Gradient, Slope
@@ -53,14 +53,11 @@ class MuJoCo:
             found, history = _course(scene, state, rows.controls + rows.noise, rows.inputs, contact.gradient)
         else:
             found, history, seen = _closed(motion, state, rows)
-        growth = None
-        if motion.measure_growth:
-            growth = _growth(scene, state, found.ctrl, rows.inputs, contact.gradient)
         observations = None if observe is None else _observations(scene, state, found, history, rows.inputs, observe)
         # What a scan carries has to look as it did.
         final = found.final if given.pairs is not None else dataclasses.replace(found.final, pairs=None)
         final = final if given.history.size == final.history.size else dataclasses.replace(final, history=given.history)
-        return dataclasses.replace(found, growth=growth, final=final, observations=observations, seen=seen)
+        return dataclasses.replace(found, final=final, observations=observations, seen=seen)
 
     def look(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
@@ -71,15 +68,13 @@ class MuJoCo:
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
     ) -> tuple[Array, Array, Array, Array]:
-        start, resting = self._arguments(scene, state)
-        inputs = {name: value[None] for name, value in (resting | {"ctrl": ctrl}).items()}
+        start, inputs = self._held(scene, state, ctrl, 1)
         A, B, C, D = rule.linearise(scene, start, inputs, gradient=contact.gradient)
         size = 2 * scene.model.nv + scene.model.na  # histories of delays come after
         return A[:size, :size], B[:size], C[:, :size], D
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
-        start, resting = self._arguments(scene, state)
-        inputs = jax.tree.map(lambda x: jnp.stack([x] * num_steps), resting | {"ctrl": ctrl})
+        start, inputs = self._held(scene, state, ctrl, num_steps)
         found = rule.roll_out(scene, changed_numbers(scene), start, inputs, contact.gradient)
         parts = {name: found[name][-1] for name in ("qpos", "qvel", "act")}
         return dataclasses.replace(state, **parts)
@@ -88,20 +83,20 @@ class MuJoCo:
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact
     ) -> tuple[Float[Array, " state"], Float[Array, "changes both"]]:
         """Return the state after a control was held, NaN if it is not finite, and the derivative by state and control."""
-        start, resting = self._arguments(scene, state)
-        inputs = jax.tree.map(lambda x: jnp.stack([x] * num_steps), resting | {"ctrl": ctrl})
-        found = rule.product(scene, start, inputs, gradient=contact.gradient, wanted=("ctrl",))
+        start, inputs = self._held(scene, state, ctrl, num_steps)
+        found = rule.product(scene, start, inputs, gradient=contact.gradient)
         size = 2 * scene.model.nv + scene.model.na
         matrix = jnp.concatenate([found["state"][:size, :size], found["ctrl"][:size]], axis=1)
         return found["end"][: scene.model.nq + scene.model.nv + scene.model.na], matrix
 
     def steer(self, scene: Scene, state: State, num_steps: int, **law: Array) -> tuple[Array, Array]:
         """Return states and controls under a feedback law, see `engines.pool.Pool.steer`."""
-        start, resting = self._arguments(scene, state)
+        start, resting = _arguments(scene, self.complete(scene, state))
         return rule.steer(scene, {"time": start["time"], **resting}, law, num_steps)
 
-    def _arguments(self, scene: Scene, state: State) -> tuple[Inputs, Inputs]:
-        return _arguments(scene, self.complete(scene, state))
+    def _held(self, scene: Scene, state: State, ctrl: Array, num_steps: int) -> tuple[Inputs, Inputs]:
+        start, resting = _arguments(scene, self.complete(scene, state))
+        return start, jax.tree.map(lambda x: jnp.stack([x] * num_steps), resting | {"ctrl": ctrl})
 
 
 def _arguments(scene: Scene, state: State) -> tuple[Inputs, Inputs]:
@@ -137,14 +132,14 @@ def _closed(motion: Motion, state: State, rows: Rows) -> tuple[Trajectory, Float
     (final, first_bad, _), (states, ctrl, seen) = jax.lax.scan(advance, first, (steps, rows))
     last = (final.qpos, final.qvel, final.act, final.history)
     states = [jnp.concatenate([x, end[None]]) for x, end in zip(states, last, strict=True)]
-    return _trajectory(states, final, ctrl, first_bad), states[3], seen
+    found = Trajectory(*states[:2], ctrl, None, final, first_bad >= 0, first_bad, act=states[2])  # pyright: ignore[reportCallIssue]
+    return found, states[3], seen
 
 
 class _Fixed:
-    """A scene whose numbers are those of its C model, but for some: programs for it are compiled once, and need no others.
+    """A scene whose numbers are those of its C model, but for some: programs for it are compiled once, and need no others."""
 
-    A call of C MuJoCo from a program takes a twentieth of a millisecond for each array that it is given; a model has a hundred.
-    """
+    # A call of C MuJoCo from a program takes a twentieth of a millisecond for each array that it is given; a model has a hundred.
 
     def __init__(self, scene: Scene, changed: Iterable[str]):
         self.scene, self.key = scene, (id(scene.mj_model), frozenset(changed))
@@ -189,28 +184,7 @@ def _steps(
     pairs = Pairs(found["flight"], found["held"])
     pairs = jax.tree.map(lambda x: jnp.where(first_bad >= 0, 0.0, x), pairs)
     final = State(qpos[-1], qvel[-1], act[-1], time, found["warmstart"], history[-1], pairs)
-    return _trajectory((qpos, qvel, act), final, ctrl, first_bad), history
-
-
-def _trajectory(
-    states: Sequence[Array], final: State, ctrl: Float[Array, "horizon nu"], first_bad: Int[Array, ""]
-) -> Trajectory:
-    qpos, qvel, act, *_ = states
-    return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act)  # pyright: ignore[reportCallIssue]
-
-
-def _growth(scene: Scene, state: State, ctrl: Array, inputs: Inputs, gradient: Gradient) -> Float[Array, ""]:
-    """Return the growth of a tangent of the start; it has no derivative."""
-    fixed = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x  # noqa: E731
-    scene, state, ctrl, inputs = jax.tree.map(fixed, (scene, state, ctrl, inputs))
-
-    def course(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        found, _ = _course(scene, dataclasses.replace(state, qpos=qpos, qvel=qvel), ctrl, inputs, gradient)
-        return found.qpos, found.qvel
-
-    _, change = jax.jvp(course, (state.qpos, state.qvel), direction(state))
-    size = jnp.linalg.norm(jnp.concatenate(change, axis=1), axis=1).max()
-    return jnp.where(jnp.isfinite(size), jnp.maximum(size, 1.0), jnp.inf)
+    return Trajectory(qpos, qvel, ctrl, None, final, first_bad >= 0, first_bad, act=act), history  # pyright: ignore[reportCallIssue]
 
 
 def _observations(

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -16,13 +16,13 @@ from jaxtyping import Float
 
 from mjxgrad._warnings import collected
 from mjxgrad.engines.events import levers_of
-from mjxgrad.engines.flight import NUM_SLOTS, Course, Flight, fly
+from mjxgrad.engines.flight import FIRST, NUM_SLOTS, PAIRS, Course, Flight, advance, fly
 from mjxgrad.engines.jacobians import APART, WIDTH, Steps, Worker, solved, with_pairs
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
 from mjxgrad.engines.processes import are_possible, are_started, processes
-from mjxgrad.engines.stepmap import FIRST, PAIRS, advance
 from mjxgrad.engines.steps import Stepper
 from mjxgrad.scene.numbers import with_numbers
+from mjxgrad.stepping import slope
 
 ONCE = (*FIRST, "flight")
 """What is found of a whole motion, not of each of its steps."""
@@ -45,13 +45,9 @@ class Pool:
     """A pool of threads for one C model. Arrays have the batch's axes in front, of length one where they are shared."""
 
     def __init__(self, mj_model: mujoco.MjModel, *, num_threads: int = _NUM_THREADS):
-        self.mj_model, self.lock = mj_model, threading.Lock()
-        self.num_threads, self.number = num_threads, next(_NUMBERS)
-        self.threads, self.start, self.layout = (
-            ThreadPoolExecutor(num_threads),
-            mujoco.MjData(mj_model),
-            Layout(mj_model),
-        )
+        self.mj_model, self.lock, self.number = mj_model, threading.Lock(), next(_NUMBERS)
+        self.num_threads, self.threads = num_threads, ThreadPoolExecutor(num_threads)
+        self.start, self.layout = mujoco.MjData(mj_model), Layout(mj_model)
         self.steps = Stepper(mj_model, self.layout, num_threads)
         self.places = self.layout.places
         self.plain = with_numbers(mj_model, {})
@@ -70,11 +66,9 @@ class Pool:
         self.first = {name: self.template[self.places[name]] for name in MOTION}
 
     def run(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, np.ndarray]:
-        """Return positions, velocities, activations and what else goes on, after each step.
-
-        With a warm start, "warmstart" is that of the next step after a single one, so that steps one by one are the same motion
-        to the last bit; after several it is zero.
-        """
+        """Return positions, velocities, activations and what else goes on, after each step."""
+        # With a warm start, "warmstart" is that of the next step after a single one, so that steps one by one are the
+        # same motion to the last bit; after several it is zero.
         with self.lock, collected():
             batch, numbers, start, inputs = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
             models = self._models(numbers, len(start["time"]))
@@ -103,7 +97,6 @@ class Pool:
         }
 
     def _run(self, models: list[mujoco.MjModel], rows: np.ndarray, inputs: _Arrays) -> dict[str, np.ndarray]:
-        """Return the same of many steps, by the pool of rollouts."""
         user = rows[:, self.places["ctrl"].start : self.places["mocap_quat"].stop]
         given = np.repeat(user[:, None], inputs["ctrl"].shape[1], axis=1)
         for name, value in inputs.items():
@@ -118,10 +111,8 @@ class Pool:
     def steer(
         self, num_substeps: int, dtype: np.dtype, numbers: _Arrays, start: _Arrays, law: _Arrays
     ) -> dict[str, np.ndarray]:
-        """Return states and controls under a law: controls that a gain corrects by the distance from nominal states, in limits.
-
-        A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
-        """
+        """Return states and controls under a law: a gain corrects controls by the distance from nominal states, within limits."""
+        # A control is rounded to a type, so that a rollout of it is the same motion, and is held for some time steps.
         with self.lock, collected():
             batch, numbers, start, law = self._flat(np.ndim(start["time"]) - 1, numbers, start, law)
             models = self._models(numbers, len(start["time"]))
@@ -157,17 +148,10 @@ class Pool:
         self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
         gradient: str, wanted: tuple[str, ...],
     ) -> dict[str, np.ndarray]:  # fmt: skip
-        """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted.
-
-        Args:
-            numbers: those of the model that differ from the file's.
-            before: states before each step, with an axis of steps as inputs have it.
-            inputs: one of each step.
-            flight: pairs in flight before the first step, packed; see `engines.flight`.
-            gradient: "discrete" or "slope".
-            wanted: names; with those of `stepmap.PAIRS` pairs of motions are followed from step to step, and "flight" has them
-                after the last.
-        """
+        """Return the derivatives of the steps of motions in tangent space, by "state" and by each input and number wanted."""
+        # Numbers are those of the model that differ from the file's; states before each step, and inputs, have an
+        # axis of steps. Where those of `flight.PAIRS` are wanted pairs of motions are followed from step to step,
+        # beginning with those in `flight`, packed; "flight" has them after the last.
         with self.lock, collected():
             ndim = np.ndim(before["time"]) - 2
             batch, numbers, states, inputs, rest = self._flat(ndim, numbers, before, inputs, {"flight": flight})
@@ -248,7 +232,9 @@ class Pool:
             work.is_finite.reshape(num, steps),
         )
         pairs = Flight.unpacked(flight, self.layout, course.rows[:, 0])
-        fly(pairs, course, self.layout, self.lengths, models[0].opt.timestep, self.steps, found)
+        by_speed = slope.TRAVEL * models[0].opt.timestep * self.lengths
+        scale = np.concatenate([self.lengths, by_speed, np.zeros(self.layout.num_rest)])
+        fly(pairs, course, self.layout, scale, self.steps, found)
         if "flight" in wanted:
             ends = course.rows[:, -1].copy()
             if (chosen := np.flatnonzero((pairs.widths > 0).any(axis=1))).size:
@@ -272,10 +258,8 @@ class Pool:
     def sense(
         self, numbers: _Arrays, states: _Arrays, inputs: _Arrays, *, wanted: tuple[str, ...] = ()
     ) -> dict[str, np.ndarray]:
-        """Return the "readings" of all sensors in states, or their derivatives by "state" and what else is wanted.
-
-        States and inputs have an axis of times. Differences are small ones: sensors do not know of events.
-        """
+        """Return the "readings" of all sensors in states, or their derivatives by "state" and what else is wanted."""
+        # States and inputs have an axis of times. Differences are small ones: sensors do not know of events.
         with self.lock, collected():
             batch, numbers, states, inputs = self._flat(np.ndim(states["time"]) - 2, numbers, states, inputs)
             num, times = inputs["ctrl"].shape[:2]
@@ -289,123 +273,85 @@ class Pool:
             self._share(lambda worker, piece: worker.sense(work, piece), self.workers, num * times)
         return {name: value.reshape(*batch, times, *value.shape[1:]) for name, value in found.items()}
 
-    def product(
-        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str, wanted: tuple[str, ...]
-    ) -> dict[str, np.ndarray]:
-        """Return the derivative of the end of a motion by its start and inputs held all the time, and "end", the state there.
+    def product(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str) -> dict[str, np.ndarray]:
+        """Return the derivative of the end of a motion by its start and by controls that are held, and "end", the state there."""
+        # MuJoCo's own differences are taken where they are right, see `Worker.differences`: they are five times faster.
+        batch, *given = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
+        (num, steps), size, nu = given[2]["ctrl"].shape[:2], self.layout.num_changes, self.mj_model.nu
+        found = {"state": np.zeros((num, size, size)), "ctrl": np.zeros((num, size, nu))}
+        found["end"], is_right = np.zeros((num, len(self.layout.motion))), np.zeros(num, bool)
+        if gradient == "discrete":
+            with self.lock, collected():
+                models = [self._exact(model) for model in self._models(given[0], num)]
+                rows = self._rows(given[1] | {name: value[:, 0] for name, value in given[2].items()})
 
-        MuJoCo's own differences are taken where they are right, see `Worker.differences`: they are five times faster.
-        """
-        if gradient == "slope" or wanted != ("ctrl",):
-            return self._composed(numbers, start, inputs, gradient=gradient, wanted=wanted)
-        with self.lock, collected():
-            batch, *given = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
-            (num, steps), size = given[2]["ctrl"].shape[:2], self.layout.num_changes
-            models = [self._exact(model) for model in self._models(given[0], num)]
-            rows = self._rows(given[1] | {name: value[:, 0] for name, value in given[2].items()})
-            found = {"state": np.zeros((num, size, size)), "ctrl": np.zeros((num, size, self.mj_model.nu))}
-            found["end"], is_right = rows[:, self.layout.motion], np.zeros(num, bool)
+                def work(worker: Worker, piece: list[int]) -> None:
+                    for i in piece:
+                        is_right[i] = worker.differences(models[i], rows[i], {k: x[i] for k, x in found.items()}, steps)
 
-            def work(worker: Worker, piece: list[int]) -> None:
-                for i in piece:
-                    is_right[i] = worker.differences(models[i], rows[i], {k: x[i] for k, x in found.items()}, steps)
-
-            self._share(work, self.workers, num)
-        for i in np.flatnonzero(~is_right):
-            parts = (_part(slice(i, i + 1), num, one) for one in given)
-            for name, value in self._composed(*parts, gradient=gradient, wanted=wanted).items():
-                found[name][i] = value[0]
+                self._share(work, self.workers, num)
+        if (left := np.flatnonzero(~is_right)).size:
+            numbers, start, inputs = (_part(left, num, one) for one in given)
+            after = self.run(numbers, start, inputs)
+            changes = np.broadcast_to(np.eye(size, size + nu), (len(left), size, size + nu))
+            pushes = np.broadcast_to(np.eye(nu, size + nu, size), (len(left), steps, nu, size + nu))
+            pushed = self._pushed(gradient, numbers, self._before(start, after), inputs, changes, pushes)
+            both = np.array([course[-1] for course in pushed])
+            found["state"][left], found["ctrl"][left] = both[..., :size], both[..., size:]
+            end = np.concatenate([after[name][:, -1] for name in MOTION], axis=-1)
+            found["end"][left] = np.where(np.isfinite(end).all(axis=-1, keepdims=True), end, np.nan)
         return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
 
-    def _composed(
-        self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str, wanted: tuple[str, ...]
-    ) -> dict[str, np.ndarray]:
-        """Return the same from the derivatives of single steps."""
-        steps = np.shape(inputs["ctrl"])[-2]
-        after = self.run(numbers, start, inputs)
-        before = self._before(start, after)
-        names = with_pairs(wanted) if gradient == "slope" and steps > 1 else wanted
-        flight = self.no_flight(np.shape(start["time"])[:-1])
-        found = self.maps(numbers, before, inputs, flight, gradient=gradient, wanted=names)
-        batch = found["state"].shape[:-3]
-        found = {name: value.reshape(-1, *value.shape[len(batch) :]) for name, value in found.items()}
-        sizes = {name: found[name].shape[-1] for name in ("state", *wanted)}
-        size, width = self.layout.num_changes, sum(sizes.values())
-        ends = []
-        for k in range(len(found["state"])):
-            one = {name: value[k] for name, value in found.items()}
-
-            def added(t: int, kind: str, rows: int, one: dict = one) -> np.ndarray:
-                parts = [one[f"{kind}{k}"][t] if f"{kind}{k}" in one else np.zeros((rows, sizes[k])) for k in wanted]
-                return np.concatenate([np.zeros((rows, size)), *parts], axis=-1)
-
-            main, held, total = np.eye(size, width), np.zeros((NUM_SLOTS, width)), None
-            for t in range(steps):
-                step = {name: one[name][t] for name in ("state", *PAIRS) if name in one}
-                step["by state"] = added(t, "", size)
-                step["by felt"] = added(t, "felt ", step["felt"].shape[0]) if "felt" in step else 0.0
-                main, held, total = advance(np, main, held, step)
-            ends.append(total)
-        parts = np.split(np.reshape(ends, (*batch, size, width)), np.cumsum(list(sizes.values()))[:-1], axis=-1)
-        end = np.concatenate([after[name][..., -1, :] for name in MOTION], axis=-1)
-        is_good = np.isfinite(end).all(axis=-1, keepdims=True)
-        return dict(zip(sizes, parts, strict=True)) | {"end": np.where(is_good, end, np.nan)}
-
     def follow(
-        self,
-        gradient: str,
-        numbers: _Arrays,
-        start: _Arrays,
-        inputs: _Arrays,
-        changes: tuple[np.ndarray, np.ndarray],
+        self, gradient: str, numbers: _Arrays, start: _Arrays, inputs: _Arrays, changes: tuple[np.ndarray, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """Return a motion as `run` does and, as "change", what becomes of a change of the start and of the controls."""
         after = self.run(numbers, start, inputs)
-        num, steps = after["qvel"].shape[:2]
-        size, before = self.layout.num_changes, self._before(start, after)
-        after["change"] = np.zeros((num, steps, size))
+        before = self._before(start, after)
         if gradient == "discrete":
-            self._along(numbers, before, inputs, changes, after["change"])
-            return after
-        wanted = ("ctrl",) if changes[1].any() else ()
-        names = with_pairs(wanted)
+            change = self._along(numbers, before, inputs, *changes)
+        else:
+            change = np.array(list(self._pushed(gradient, numbers, before, inputs, *changes)))
+        return after | {"change": change}
+
+    def _pushed(
+        self, gradient: str, numbers: _Arrays, before: _Arrays, inputs: _Arrays, changes: np.ndarray, pushes: np.ndarray
+    ) -> Iterator[list[np.ndarray]]:
+        """Give what becomes of changes of each motion's start and controls, of one column or several, after each step."""
+        (num, steps), size = before["qvel"].shape[:2], self.layout.num_changes
+        wanted = ("ctrl",) if pushes.any() else ()
+        names = with_pairs(wanted) if gradient == "slope" and steps > 1 else wanted
         together = max(1, int(_MOST_NUMBERS / (steps * size * (2 * size + NUM_SLOTS))))
         for first in range(0, num, together):
-            part = slice(first, first + together)
-            cut = functools.partial(_part, part, num)
-            flight = self.no_flight((len(range(num)[part]),))
-            found = self.maps(cut(numbers), cut(before), cut(inputs), flight, gradient=gradient, wanted=names)
-            for k, motion in enumerate(range(num)[part]):
-                main, held = changes[0][motion], np.zeros(NUM_SLOTS)
-                for t, push in enumerate(changes[1][motion]):
+            motions = range(num)[first : first + together]
+            given = (_part(slice(first, first + together), num, one) for one in (numbers, before, inputs))
+            found = self.maps(*given, self.no_flight((len(motions),)), gradient=gradient, wanted=names)
+            for k, motion in enumerate(motions):
+                main, course = changes[motion], []
+                held = np.zeros((NUM_SLOTS, *main.shape[1:]))
+                for t, push in enumerate(pushes[motion]):
                     one = {name: found[name][k, t] for name in ("state", *PAIRS) if name in found}
                     one |= {"by state": found["ctrl"][k, t] @ push if wanted else 0.0, "by felt": 0.0}
-                    main, held, after["change"][motion, t] = advance(np, main, held, one)
-        return after
+                    main, held, total = advance(np, main, held, one)
+                    course.append(total)
+                yield course
 
     @np.errstate(invalid="ignore", over="ignore")
     def _along(
-        self,
-        numbers: _Arrays,
-        before: _Arrays,
-        inputs: _Arrays,
-        changes: tuple[np.ndarray, np.ndarray],
-        found: np.ndarray,
-    ) -> None:
-        """Write what becomes of changes by differences of whole steps along them: three steps each, not a hundred.
-
-        Where the two sides differ as at a jump, or one is beyond the limits of a control, the other one counts.
-        """
+        self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, main: np.ndarray, pushes: np.ndarray
+    ) -> np.ndarray:
+        """Return what becomes of changes by differences of whole steps along them: three steps each, not a hundred."""
+        # Where the two sides differ as at a jump, or one is beyond the limits of a control, the other one counts.
         with self.lock, collected():
             _, numbers, before, inputs = self._flat(1, numbers, before, inputs)
-            models = [self._exact(model) for model in self._models(numbers, len(found))]
+            models = [self._exact(model) for model in self._models(numbers, len(main))]
             controls, timestep = self.places["ctrl"], models[0].opt.timestep
             low, high = np.where(
                 self.mj_model.actuator_ctrllimited, self.mj_model.actuator_ctrlrange.T, [[-np.inf], [np.inf]]
             )
-            main, sides = changes[0], np.array([1.0, 0.0, -1.0])[:, None, None]
-            for t in range(found.shape[1]):
-                rows, push = self._rows({k: x[:, t] for k, x in {**before, **inputs}.items()}), changes[1][:, t]
+            found, sides = [], np.array([1.0, 0.0, -1.0])[:, None, None]
+            for t in range(pushes.shape[1]):
+                rows, push = self._rows({k: x[:, t] for k, x in {**before, **inputs}.items()}), pushes[:, t]
                 size = np.abs(np.concatenate([main, push], axis=1)).max(axis=1, keepdims=True)
                 width = WIDTH / np.where(size > 0, size, 1.0)
                 starts = self.layout.moved(rows, sides * width * main)
@@ -423,22 +369,19 @@ class Pool:
                 last = np.where(is_jump, sizes[1] <= sizes[0], True) & ~behind.any(axis=1)
                 share = np.stack([first, last]) / np.maximum(first.astype(int) + last, 1)
                 main = np.nan_to_num(np.sum(share[..., None] * both, axis=0), posinf=0.0, neginf=0.0)
-                found[:, t] = main
+                found.append(main)
+        return np.stack(found, axis=1)
 
     def no_flight(self, batch: tuple[int, ...]) -> np.ndarray:
-        """Return the room of motions without pairs in flight."""
         return np.zeros((*batch, *self.flight_shape))
 
     @property
     def flight_shape(self) -> tuple[int, int]:
-        """Slots, and numbers of a pair."""
         return NUM_SLOTS, 2 * self.layout.num_changes + 3
 
     def shapes(self, wanted: tuple[str, ...], sizes: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the derivatives of one step, of its end by all that is wanted.
-
-        Those of `ONCE` belong to a whole motion.
-        """
+        """Return the shapes of the derivatives of one step, of its end by all that is wanted."""
+        # Those of `ONCE` belong to a whole motion.
         model, size = self.mj_model, self.layout.num_changes
         own = {"felt": (model.nv, size), "slot": (model.nv,), "apart": (size, NUM_SLOTS), "stays": (NUM_SLOTS,)}
         own |= {"before": (size, NUM_SLOTS), "enters": (NUM_SLOTS,), "flight": self.flight_shape}
@@ -446,17 +389,14 @@ class Pool:
         return {"state": (size, size)} | {k: own[k] for k in wanted}
 
     def _before(self, start: _Arrays, after: _Arrays) -> dict[str, np.ndarray]:
-        """Return states before each step."""
         found = {}
         for name in MOTION:
             first = np.asarray(start[name], float)[..., None, :] if name in start else self.template[self.places[name]]
             first = np.broadcast_to(first, (*after[name].shape[:-2], 1, after[name].shape[-1]))
             found[name] = np.concatenate([first, after[name][..., :-1, :]], axis=-2)
         steps = after["qpos"].shape[-2]
-        found["time"] = (
-            np.asarray(start["time"], float)[..., None, :] + self.mj_model.opt.timestep * np.arange(steps)[:, None]
-        )
-        return found
+        times = self.mj_model.opt.timestep * np.arange(steps)[:, None]
+        return found | {"time": np.asarray(start["time"], float)[..., None, :] + times}
 
     def _exact(self, model: mujoco.MjModel) -> mujoco.MjModel:
         """Return a model as it is differentiated; the last is kept."""
@@ -465,7 +405,6 @@ class Pool:
         return self.exact[1]
 
     def _share(self, work: Callable, workers: list, count: int) -> None:
-        """Do so many things on all threads; each takes its piece of them."""
         pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(self.num_threads, count))]
         list(map(work, workers, pieces) if len(pieces) == 1 else self.threads.map(work, workers, pieces))
 
@@ -495,10 +434,8 @@ class Pool:
         return [with_numbers(base, {name: x[i] for name, x in varied.items()}) for i in range(count)]
 
     def _exactly(self, name: str, value: np.ndarray) -> np.ndarray:
-        """Return an array in double precision; positions that single precision rounded have the digits of the file again.
-
-        A body that stands on the floor in the file would else begin a nanometre above or below it.
-        """
+        """Return an array in double precision; positions that single precision rounded have the digits of the file again."""
+        # A body that stands on the floor in the file would else begin a nanometre above or below it.
         given = np.asarray(value)
         found = given.astype(float)
         if name in ("qpos", "states") and given.dtype == np.float32:  # of a law, whose states begin with positions
@@ -508,13 +445,11 @@ class Pool:
         return found
 
     def _rows(self, start: _Arrays) -> Float[np.ndarray, "rows size"]:
-        """Return whole states of MuJoCo, one a row, of which the start is given."""
         rows = np.tile(self.template, (len(start["time"]), 1))
         for name, value in start.items():
             rows[:, self.places[name]] = value.reshape(len(rows), math.prod(value.shape[1:]))
         return rows
 
 
-def _part(part: slice, count: int, arrays: _Arrays) -> dict[str, np.ndarray]:
-    """Return some of a batch; what all share stays."""
+def _part(part: slice | np.ndarray, count: int, arrays: _Arrays) -> dict[str, np.ndarray]:
     return {name: value[part] if len(value) == count else value for name, value in arrays.items()}

@@ -1,6 +1,5 @@
 """Processes that take derivatives of a batch's pieces, where threads would wait for Python's lock.
 
-A derivative of a step is a hundred short calls of C, between which Python holds its lock: threads keep two or three cores busy.
 A process needs MuJoCo and NumPy alone, so that it starts in half a second and imports no JAX. Results are written into shared
 memory. Questions go through a pipe, whose end is the end of the process.
 """
@@ -89,14 +88,10 @@ class Processes:
     def share(
         self, key: int, model: mujoco.MjModel, count: int, shapes: Mapping[str, tuple[int, ...]], arguments: Any
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of these shapes, whose pieces along the first axis `Pool.write` has written.
+        """Return so many rows of these arrays of doubles, whose pieces `Pool.write` has written.
 
-        Args:
-            key: the pool's number; a process makes one of its own where it does not know it.
-            model: its C model.
-            count: the length of the first axis.
-            shapes: those of the arrays, of doubles.
-            arguments: function from a slice to what `Pool.write` takes beside arrays.
+        A process makes a pool of its own where it does not know the key. `arguments` is a function from a slice to what
+        `Pool.write` takes beside arrays.
 
         Raises:
             OSError: a process has ended.
@@ -182,7 +177,6 @@ def _memory(shapes: Mapping[str, tuple[int, ...]]) -> Iterator[tuple[str, dict[s
 
 
 def _arrays(memory: mmap.mmap, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Return arrays that lie in memory one after the other."""
     found, place = {}, 0
     for name, shape in shapes.items():
         count = int(np.prod(shape))

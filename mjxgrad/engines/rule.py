@@ -1,15 +1,12 @@
 """Rollouts of C MuJoCo under `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`.
 
 The motion is one call; the derivatives of all its steps are another, once the motion is known, and the recursion of
-`engines.stepmap` takes a change of the start to the end. JAX transposes that recursion: forward and reverse mode are one formula.
-
-Pairs of motions that are in flight at the end (see `engines.flight`) are part of the state, so that a rollout that goes on
-from there, one step of a policy or of an environment, has the derivative of one that was never interrupted. They are only there
-while JAX differentiates: elsewhere nobody asks for them.
+`engines.flight` takes a change of the start to the end. JAX transposes that recursion: forward and reverse mode are one formula.
+Pairs of motions that are in flight at the end are part of the state while JAX differentiates, so that a rollout that goes on from
+there has the derivative of one that was never interrupted.
 """
 
 import functools
-import itertools
 import math
 import warnings
 from collections.abc import Mapping
@@ -24,11 +21,10 @@ from jaxtyping import Array, Float
 
 from mjxgrad._warnings import give_up_if_stopped
 from mjxgrad.bodies.kinematics import integrate_position, position_change
-from mjxgrad.engines.flight import NUM_SLOTS
+from mjxgrad.engines.flight import NUM_SLOTS, PAIRS, advance, begin
 from mjxgrad.engines.jacobians import with_pairs
 from mjxgrad.engines.layout import MOTION
 from mjxgrad.engines.pool import ONCE, Pool, pool_of
-from mjxgrad.engines.stepmap import PAIRS, advance, begin
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -37,18 +33,10 @@ _Arrays = Mapping[str, Array]
 
 
 def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gradient: Gradient) -> dict[str, Array]:
-    """Return the parts of `layout.MOTION` after each step, as MuJoCo gives them; differentiable once, by all arguments.
-
-    Args:
-        scene: its C model steps.
-        numbers: those of the scene's model that its C model does not have; they may be mapped over and differentiated by.
-        start: `time` of shape (1,) and the parts of the motion; "warmstart", "flight" and "held" as in `State`.
-        inputs: arrays with one row per step, under names of `INPUTS`; `ctrl` at least.
-        gradient: "discrete", the derivative of MuJoCo's step, or "slope", that of its outcome; see `engines.events`.
-
-    Returns:
-        Each with one row per step; "warmstart", "flight" and "held" after the last.
-    """
+    """Return the parts of `layout.MOTION` after each step, as MuJoCo gives them; differentiable once, by all arguments."""
+    # Numbers are those of the scene's model that its C model does not have. The start has `time` of shape (1,), the parts of the
+    # motion, and "warmstart", "flight" and "held" as in `State`; inputs have one row per step under names of `INPUTS`, `ctrl` at
+    # least. All found has one row per step but "warmstart", "flight" and "held", which are those after the last.
     pool, dtype = pool_of(scene.mj_model), start["qpos"].dtype
     horizon = len(inputs["ctrl"])
     shapes = {k: jax.ShapeDtypeStruct((horizon, *start[k].shape), dtype) for k in MOTION}
@@ -65,27 +53,22 @@ def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gr
         numbers, start, inputs = primals
         found = call(*primals)
         by_number, by_start, by_input = tangents
-        given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
+        given = _without_zeros({**by_input, **by_number})
         before = {k: jnp.concatenate([start[k][None], found[k][:-1]]) for k in MOTION}
-        before["time"] = (
-            start["time"]
-            + numbers.get("opt.timestep", scene.mj_model.opt.timestep) * jnp.arange(horizon, dtype=dtype)[:, None]
-        )
+        timestep = numbers.get("opt.timestep", scene.mj_model.opt.timestep)
+        before["time"] = start["time"] + timestep * jnp.arange(horizon, dtype=dtype)[:, None]
         wanted = (*with_pairs(tuple(given)), "flight") if gradient == "slope" else tuple(given)
         maps = _maps(pool, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
-        forced = {part: jnp.zeros(maps[part].shape[:2], dtype) for part in ("state", "felt") if part in maps}
-        for part, name in itertools.product(forced, given):
-            own = name if part == "state" else f"{part} {name}"
-            if own in maps:
-                change = given[name].reshape((horizon, -1) if name in by_input else -1).astype(dtype)
-                forced[part] += jnp.einsum("tsc,tc->ts" if name in by_input else "tsc,c->ts", maps[own], change)
-        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
-        changes = {k: zero(by_start[k]) for k in (*MOTION, "held")}
+        forced = {}
+        for part, prefix in (("state", ""), ("felt", "felt ")):
+            if part in maps:
+                by = {name: maps[prefix + name] for name in given if prefix + name in maps}
+                forced[f"by {part}"] = _added(jnp.zeros(maps[part].shape[:2], dtype), by, given, by_input)
+        changes = {k: _dense(by_start[k]) for k in (*MOTION, "held")}
         to_tangent = functools.partial(position_change, scene.model, start["qpos"])
         moved = jax.jvp(to_tangent, (start["qpos"],), (changes["qpos"],))[1]
         first = jnp.concatenate([moved, *(changes[name] for name in MOTION[1:])])
-        steps = {name: maps[name] for name in ("state", *PAIRS) if name in maps}
-        steps |= {f"by {name}": x for name, x in forced.items()}
+        steps = {name: maps[name] for name in ("state", *PAIRS) if name in maps} | forced
 
         def through(carry: tuple[Array, Array], step: dict[str, Array]) -> tuple[tuple[Array, Array], Array]:
             main, held, total = advance(jnp, *carry, step)
@@ -97,11 +80,9 @@ def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gr
         sizes = [scene.model.nv, *(start[name].size for name in MOTION[1:])]
         parts = jnp.split(course, np.cumsum(sizes)[:-1].tolist(), axis=1)
         parts[0] = jax.vmap(functools.partial(to_coordinates, scene))(found["qpos"], parts[0])
-        own = nothing() if gradient == "discrete" else {"flight": maps["flight"], "held": jnp.zeros_like(held)}
-        change = {
-            "flight": jnp.zeros_like(own["flight"]),
-            "held": jnp.zeros_like(held) if gradient == "discrete" else held,
-        }
+        own, change = nothing(), nothing()
+        if gradient == "slope":
+            own["flight"], change["held"] = maps["flight"], held
         change["warmstart"] = jnp.zeros_like(start["qvel"])
         return found | own, dict(zip(MOTION, parts, strict=True)) | change
 
@@ -119,14 +100,11 @@ def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tupl
     return jnp.concatenate([first[None], found["states"]]), found["controls"]
 
 
-def product(
-    scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient, wanted: tuple[str, ...]
-) -> dict[str, Array]:
-    """Return the derivative of several steps by "state" and inputs that are held, and "end", the state after them."""
+def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient) -> dict[str, Array]:
+    """Return the derivative of several steps by "state" and by "ctrl" that is held, and "end", the state after them."""
     pool = pool_of(scene.mj_model)
-    sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()}
-    shapes = pool.shapes(wanted, sizes) | {"end": (sum(start[name].size for name in MOTION),)}
-    function = functools.partial(pool.product, gradient=gradient, wanted=wanted)
+    shapes = pool.shapes(("ctrl",), _sizes({}, inputs)) | {"end": (sum(start[name].size for name in MOTION),)}
+    function = functools.partial(pool.product, gradient=gradient)
     return _once(function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
 
 
@@ -160,30 +138,19 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
     def _derivative(primals, tangents) -> tuple[Array, Array]:
         numbers, states, inputs = primals
         by_number, by_state, by_input = tangents
-        given = {k: t for k, t in {**by_input, **by_number}.items() if not isinstance(t, SymbolicZero)}
-        sizes = {
-            name: primal[name].size // (times if primal is inputs else 1)
-            for primal in (inputs, numbers)
-            for name in primal
-        }
-        sizes["state"] = pool.layout.num_changes
+        given = _without_zeros({**by_input, **by_number})
+        sizes = _sizes(numbers, inputs) | {"state": pool.layout.num_changes}
         wanted = ("state", *given)
         shapes = {name: (times, count, sizes[name]) for name in wanted}
         found = _once(functools.partial(pool.sense, wanted=wanted), shapes, dtype, numbers, states, inputs)
-        zero = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x  # noqa: E731  # pyright: ignore
 
         def in_tangent_space(qpos: Array, change: Array) -> Array:
             return jax.jvp(functools.partial(position_change, scene.model, qpos), (qpos,), (change,))[1]
 
-        parts = [jax.vmap(in_tangent_space)(states["qpos"], zero(by_state["qpos"]))]
-        parts += [zero(by_state[name]) for name in MOTION[1:]]
+        parts = [jax.vmap(in_tangent_space)(states["qpos"], _dense(by_state["qpos"]))]
+        parts += [_dense(by_state[name]) for name in MOTION[1:]]
         change = jnp.einsum("tsc,tc->ts", found["state"], jnp.concatenate(parts, axis=1), precision="highest")
-        for name, tangent in given.items():
-            own = tangent.reshape((times, -1) if name in by_input else -1).astype(dtype)
-            change += jnp.einsum(
-                "tsc,tc->ts" if name in by_input else "tsc,c->ts", found[name], own, precision="highest"
-            )
-        return call(*primals), change
+        return call(*primals), _added(change, found, given, by_input)
 
     return call(changed_numbers(scene), dict(states), dict(inputs))
 
@@ -191,11 +158,31 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
 def _maps(
     pool: Pool, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
 ) -> dict[str, Array]:
-    """Return what `Pool.maps` gives of states before each step."""
-    horizon = len(inputs["ctrl"])
-    sizes = {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
-    shapes = {k: v if k in ONCE else (horizon, *v) for k, v in pool.shapes(how["wanted"], sizes).items()}
+    horizon, every = len(inputs["ctrl"]), pool.shapes(how["wanted"], _sizes(numbers, inputs))
+    shapes = {k: v if k in ONCE else (horizon, *v) for k, v in every.items()}
     return _once(functools.partial(pool.maps, **how), shapes, before["qpos"].dtype, numbers, before, inputs, flight)
+
+
+def _sizes(numbers: _Arrays, inputs: _Arrays) -> dict[str, int]:
+    return {name: math.prod(x.shape[1:]) for name, x in inputs.items()} | {name: x.size for name, x in numbers.items()}
+
+
+def _without_zeros(tangents: Mapping[str, Any]) -> dict[str, Array]:
+    return {name: one for name, one in tangents.items() if not isinstance(one, SymbolicZero)}
+
+
+def _dense(tangent: Any) -> Array:
+    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
+
+
+def _added(change: Array, by: _Arrays, given: _Arrays, inputs: Mapping[str, Any]) -> Array:
+    """Return changes after each step with what tangents of inputs, and of numbers that all steps share, add to them."""
+    for name, matrix in by.items():
+        if name in given:
+            is_input, own = name in inputs, given[name].astype(change.dtype)
+            own = own.reshape((len(change), -1) if is_input else -1)
+            change += jnp.einsum("tsc,tc->ts" if is_input else "tsc,c->ts", matrix, own, precision="highest")
+    return change
 
 
 def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *arguments) -> dict[str, Array]:

@@ -18,15 +18,11 @@ LARGEST_GROWTH = 1e3
 
 
 class Pairs(eqx.Module):
-    """Pairs of motions that a slope by C MuJoCo follows, see `engines.flight`; empty where nothing is differentiated.
+    """Pairs of motions that a slope by C MuJoCo follows, see `engines.flight`; empty where nothing is differentiated."""
 
-    Attributes:
-        flight: both motions of each, as changes of the state, how far apart they began, and how they are followed.
-        held: zeros, whose derivative is what each pair has felt of a change.
-    """
-
+    # Both motions of each, as changes of the state, how far apart they began, and how they are followed.
     flight: Float[Array, "slots numbers"]
-    held: Float[Array, " slots"]
+    held: Float[Array, " slots"]  # zeros, whose derivative is what each pair has felt of a change
 
 
 class State(eqx.Module):
@@ -64,10 +60,9 @@ class Trajectory(eqx.Module):
         final: the last state, to continue from.
         diverged: whether some step gave a non-finite or runaway state, or the model holds NaN.
         first_bad_step: the first such step, −1 if there is none. From there on the state stays at the last good one.
-        unsolved: number of steps before it with an inaccurate solve: it ran into the model's iteration limit, or this
-            precision does not resolve its forces to a thousandth, by an estimate of rounding. Motion and derivative, which
-            assumes a converged solve, are then inexact. Zero, unless `opt.iterations` is small or, in single precision,
-            pyramids have little friction (below 0.01; elliptic cones hardly have such a limit). Only `rollout` counts it.
+        unsolved: number of steps before it with an inaccurate solve: it ran into the model's iteration limit, or this precision
+            does not resolve its forces to a thousandth. Motion and derivative are then inexact. Zero, unless `opt.iterations` is
+            small or, in single precision, pyramids have little friction (below 0.01). Only `rollout` counts it.
         crowded: number of steps before it in which more contacts may have acted than the scene has slots for, see
             `max_contacts` of `load_scene`. Smoothed contacts act at any distance, so then every step of such a scene counts.
         growth: largest growth of one fixed unit tangent of all initial velocities and positions along the way, if asked for.

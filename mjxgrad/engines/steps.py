@@ -22,7 +22,6 @@ class Stepper:
         self.memory = [mujoco.MjData(model) for _ in range(num_threads)]
 
     def full(self, rows: Float[np.ndarray, "rows size"]) -> Float[np.ndarray, "rows physics"]:
-        """Return the physical part of whole states."""
         return np.concatenate([rows[:, self.layout.places[name]] for name in START], axis=1)
 
     def motions(self, found: Float[np.ndarray, "... physics"]) -> dict[str, np.ndarray]:

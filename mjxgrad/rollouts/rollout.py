@@ -1,5 +1,6 @@
 """Rollouts of a scene, and linear models of its steps: arguments are checked here, and its engine steps it."""
 
+import dataclasses
 import warnings
 from collections.abc import Mapping
 from typing import Any, get_args
@@ -11,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from mjxgrad._arrays import function, instance, known, real, whole
+from mjxgrad._programs import compiled
 from mjxgrad.batched.device import copies, fits
 from mjxgrad.engines import Motion, Observe, PolicyFunction, Rows, Sees, State, Trajectory, engine_of
 from mjxgrad.engines.layout import INPUTS
-from mjxgrad.engines.state import check_scene
+from mjxgrad.engines.state import check_scene, direction
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact, Discrete, Slope, Smoothing, smoothing_warnings
 
@@ -61,8 +63,7 @@ def rollout(
         checkpoint: whether to recompute each step in reverse mode from its state and the solutions of its solves. Memory then
             grows by a few numbers per step. False keeps everything: somewhat faster, and hundreds of times larger.
         measure_growth: whether to propagate one tangent, for `growth` and `explodes`: they tell whether the derivatives can
-            be trusted. Chattering contacts may multiply derivatives at every switch. It costs as much as a derivative in
-            forward mode.
+            be trusted. Chattering contacts may multiply derivatives at every switch. It costs a derivative in forward mode.
 
     Raises:
         ValueError: if contact is none of the four records, shapes do not fit the scene, the horizon is missing or contradicted,
@@ -90,9 +91,29 @@ def rollout(
     forces = applied(scene, inputs, horizon)
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     rows = Rows(base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
-    ways = (policy_sees, checkpoint, contact, measure_growth)
-    motion = Motion(scene, policy, params if policy is not None else None, observe, *ways)
-    return engine.roll_out(motion, state, rows)
+    motion = Motion(scene, policy, params if policy is not None else None, observe, policy_sees, checkpoint, contact)
+    found = engine.roll_out(motion, state, rows)
+    if not measure_growth:
+        return found
+    alone = Motion(scene, None, None, None, "state", checkpoint, contact)
+    given = Rows(found.ctrl, jnp.zeros_like(found.ctrl), forces)
+    return dataclasses.replace(found, growth=_growth(alone, state, given))
+
+
+@compiled
+def _growth(motion: Motion, state: State, rows: Rows) -> Float[Array, ""]:
+    """Return the largest growth of a tangent of the start under known controls; it has no derivative."""
+    fixed = lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x  # noqa: E731
+    motion, state, rows = jax.tree.map(fixed, (motion, state, rows))
+
+    def course(qpos: Array, qvel: Array) -> tuple[tuple[Array, Array], Array]:
+        start = dataclasses.replace(state, qpos=qpos, qvel=qvel)
+        found = engine_of(motion.scene, motion.contact).roll_out(motion, start, rows)
+        return (found.qpos, found.qvel), found.diverged
+
+    _, change, diverged = jax.jvp(course, (state.qpos, state.qvel), direction(state), has_aux=True)
+    size = jnp.linalg.norm(jnp.concatenate(change, axis=1), axis=1).max()
+    return jnp.where(jnp.isfinite(size) & ~diverged, jnp.maximum(size, 1.0), jnp.inf)
 
 
 class Linearisation(eqx.Module):

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 
 from mjxgrad.engines import flight as flights
-from mjxgrad.engines.flight import NUM_SLOTS, Begun, Course, Flight, fly
+from mjxgrad.engines.flight import NUM_SLOTS, Begun, Course, Flight, advance, begin, fly
 from mjxgrad.engines.layout import Layout
-from mjxgrad.engines.stepmap import advance, begin
+from mjxgrad.stepping import slope
 
 # One slide without forces: a state is a place and a speed, and a step of a pair is whatever a test says.
 MODEL = mujoco.MjModel.from_xml_string(
@@ -46,7 +46,7 @@ def _flown(matrices, begun, factors):
         return ends
 
     pairs = _nothing()
-    fly(pairs, course, LAYOUT, np.ones(1), 0.1, step, found)
+    fly(pairs, course, LAYOUT, np.array([1.0, 0.1 * slope.TRAVEL]), step, found)
     return {name: value[0] for name, value in found.items()} | {"state": state[0]}
 
 
