@@ -2,9 +2,10 @@
 
 import dataclasses
 import functools
+import itertools
 from dataclasses import dataclass
 from timeit import timeit
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from pydantic import Field
 from experiments.problems import left_out
 from experiments.problems.left_out import ONLY_GRADIENT, PARTS, PartName, SceneName
 from experiments.report import Table
-from experiments.settings import RunSettings, SettingsTable
+from experiments.settings import SettingsTable, SizedSettings
 from experiments.theme import FIRST, MUTED, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.words import joined, quantity
 from experiments.workspace import Workspace
@@ -28,27 +29,20 @@ _TITLES: dict[EngineName, str] = {"mjx": "MJX", "mujoco": "C MuJoCo"}
 class Sizes(SettingsTable):
     """How much is measured."""
 
+    # What MJX is given back in each scene; C MuJoCo, whose programs are small, is given back all that it leaves out.
     scenes: dict[SceneName, tuple[PartName, ...]]
-    """What MJX is given back in each scene; C MuJoCo, whose programs are small, is given back all that it leaves out."""
-    batch: _Count
-    """Rollouts that MJX steps together."""
-    few: _Count
-    """Rollouts that C MuJoCo steps together."""
-    horizon: _Count
-    """Time steps of a rollout."""
-    repeats: _Count
-    """Turns, in each of which every program runs once."""
+    batch: _Count  # rollouts that MJX steps together
+    few: _Count  # rollouts that C MuJoCo steps together
+    horizon: _Count  # time steps of a rollout
+    repeats: _Count  # turns, in each of which every program runs once
 
 
-class Settings(RunSettings):
+class Settings(SizedSettings):
     """Time, memory and results of scenes with parts put back."""
 
-    size: Literal["quick", "default", "full"] = "default"
-    """How much is measured."""
     sizes: Sizes
-    """The numbers that go with the size: those of the file's table of that name."""
+    # Scenes in place of the size's, with what MJX is given back in each.
     scenes: dict[SceneName, tuple[PartName, ...]] = Field(default_factory=dict)
-    """Scenes in place of the size's, with what MJX is given back in each."""
 
     @property
     def chosen(self) -> dict[SceneName, tuple[PartName, ...]]:
@@ -58,27 +52,20 @@ class Settings(RunSettings):
 
 @dataclass(frozen=True)
 class Cost:
-    """What a part costs that is put back into one program, over what that takes without it.
-
-    Attributes:
-        time: quartiles and median over turns.
-        seconds, num_bytes, compile_seconds: without the part.
-        difference: largest change of a result, over the largest result.
-        rounding: the same of a start that is moved by four roundings.
-    """
+    """What a part costs that is put back into one program, over what that takes without it."""
 
     scene: str
     engine: EngineName
     part: str
     work: str
-    time: tuple[float, float, float]
+    time: tuple[float, float, float]  # quartiles and median over turns
     memory: float
     compilation: float
-    seconds: float
+    seconds: float  # without the part, as the next two
     num_bytes: float
     compile_seconds: float
-    difference: float
-    rounding: float
+    difference: float  # largest change of a result, over the largest result
+    rounding: float  # the same of a start that is moved by four roundings
 
     @property
     def is_same(self) -> bool:
@@ -99,16 +86,13 @@ class Outcome:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Measure scene by scene."""
-    costs, had_cache = [], jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    had_cache = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_compilation_cache", False)  # compilation is measured, too
     try:
-        with workspace.stage("scenes", "scenes", len(settings.chosen)) as advance_to:
-            for k, name in enumerate(settings.chosen, start=1):
-                costs += workspace.once(name, functools.partial(of_scene, name, settings))
-                advance_to(k)
+        parts = {name: functools.partial(of_scene, name, settings) for name in settings.chosen}
+        return Outcome(settings, list(itertools.chain(*workspace.each("scenes", "scenes", parts))))
     finally:
         jax.config.update("jax_enable_compilation_cache", had_cache)
-    return Outcome(settings, costs)
 
 
 def of_scene(name: SceneName, settings: Settings) -> list[Cost]:
@@ -217,9 +201,8 @@ def tables(outcome: Outcome) -> list[Table]:
             f"{sizes.horizon} steps of {sizes.batch if engine == 'mjx' else sizes.few} rollouts."
         )
         columns = ("scene", f"back into {title}", "why not", "work", "time", "memory", "compilation", "difference")
-        found.append(
-            Table(columns, rows, caption, frozenset((i, 4) for i, c in enumerate(costs) if c.time[0] > _LEAST))
-        )
+        bold = frozenset((i, 4) for i, c in enumerate(costs) if c.time[0] > _LEAST)
+        found.append(Table(columns, rows, caption, bold))
     return found
 
 

@@ -51,57 +51,52 @@ _RESAMPLES = 400
 class Settings(OwnScene, RunSettings):
     """Mean squared errors of estimates, over batches of the same rollouts."""
 
+    # Costs of one number with closed forms, also as the sum over many.
     textbook: tuple[TextbookName, ...] = ("heaviside", "soft_heaviside", "quadratic_sine")
-    """Costs of one number with closed forms, also as the sum over many."""
-    points: tuple[float, ...] = (0.0, 0.1, 0.2)
-    """Where these are estimated, for a width of 0.1 of the noise."""
-    dims: tuple[Annotated[int, Field(ge=1)], ...] = (1, 40)
-    """Over how many numbers they are summed."""
+    points: tuple[float, ...] = (0.0, 0.1, 0.2)  # where these are estimated, for a width of 0.1 of the noise
+    dims: tuple[Annotated[int, Field(ge=1)], ...] = (1, 40)  # over how many numbers they are summed
+    # Published tasks, at their start and later.
     tasks: tuple[TaskName, ...] = ("push_soft", "push_stiff", "friction", "lqr", "motion_planning", "tennis")
-    """Published tasks, at their start and later."""
+    # Steps of their descent by an unbiased estimate, after which they are measured once more.
     later: Annotated[int, Field(ge=0)] = 60
-    """Steps of their descent by an unbiased estimate, after which they are measured once more."""
-    walls: tuple[Positive, ...] = (1e2, 1e3, 1e4, 1e5)
-    """Stiffness of the wall in a throw (1/s²)."""
+    walls: tuple[Positive, ...] = (1e2, 1e3, 1e4, 1e5)  # stiffness of the wall in a throw (1/s²)
+    # Angles of throws (rad) whose contacts, MuJoCo's default ones, set in with a jump of force; by both derivatives.
     throws: tuple[Positive, ...] = (0.5, 0.8, 0.95)
-    """Angles of throws (rad) whose contacts, MuJoCo's default ones, set in with a jump of force; by both derivatives."""
+    # Of gymnasium, by C MuJoCo; their controls under noise, by both derivatives.
     robots: tuple[RobotName, ...] = ("hopper", "walker2d", "half_cheetah", "ant")
-    """Of gymnasium, by C MuJoCo; their controls under noise, by both derivatives."""
-    stddev: Positive = 0.3
-    """Of the noise on controls, in halves of their range."""
+    stddev: Positive = 0.3  # of the noise on controls, in halves of their range
+    # Samples of an estimate.
     batches: Annotated[tuple[Annotated[int, Field(ge=4)], ...], Field(min_length=1)] = (16, 64, 256)
-    """Samples of an estimate."""
+    # Rollouts that are differentiated, in all batches together; on robots a quarter, on closed forms four times as many.
     num_samples: Annotated[int, Field(ge=512)] = 4096
-    """Rollouts that are differentiated, in all batches together; on robots a quarter, on closed forms four times as many."""
+    # Rollouts without derivatives that the truth of robots is from.
     num_truth: Annotated[int, Field(ge=4000)] = 64_000
-    """Rollouts without derivatives that the truth of robots is from."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One problem with one derivative, estimated by batches of one size.
-
-    Attributes:
-        error: mean squared errors by method, over the squared norm of the truth.
-        spread: their standard errors over batches.
-        ratio: error of α-order over that of the better of first and zeroth order.
-        ratio_interval: of 95 %, by resampling batches.
-        alpha: mean weight of α-order.
-        bias: that of first order, over the norm of the truth, by all samples; zero where noise hides it.
-        truth_error: squared error of the truth, over its squared norm; taken off from all errors.
-    """
+    """One problem with one derivative, estimated by batches of one size."""
 
     problem: str
     derivative: str
     dim: int
     batch: int
-    error: dict[str, float]
-    spread: dict[str, float]
-    ratio: float
-    ratio_interval: tuple[float, float]
-    alpha: float
-    bias: float
-    truth_error: float
+    error: dict[str, float]  # mean squared errors by method, over the squared norm of the truth
+    spread: dict[str, float]  # their standard errors over batches
+    ratio_interval: tuple[float, float]  # of the ratio, of 95 %, by resampling batches
+    alpha: float  # mean weight of α-order
+    bias: float  # that of first order, over the norm of the truth, by all samples; zero where noise hides it
+    truth_error: float  # squared error of the truth, over its squared norm; taken off from all errors
+
+    def over_better(self, name: str) -> float:
+        """Return the error of a method over that of the better of first and zeroth order."""
+        better = min(self.error[FIRST_ORDER], self.error[ZEROTH_ORDER])
+        return max(self.error[name], 1e-300) / max(better, 1e-300)
+
+    @property
+    def ratio(self) -> float:
+        """That of α-order."""
+        return self.over_better(ALPHA)
 
 
 @dataclass(frozen=True)
@@ -310,7 +305,6 @@ def _cell(
         batch,
         {name: float(x.mean() / scale) for name, x in squares.items()},
         {name: float(x.std(ddof=1) / np.sqrt(number) / scale) for name, x in squares.items()},
-        ratio(np.arange(number)),
         (float(low), float(high)),
         float(np.mean(alpha)),
         _bias(np.asarray(values[FIRST_ORDER], float), truth, truth_error),
@@ -331,7 +325,7 @@ def verdict(outcome: Outcome) -> str:
     worst = cells[int(outcome.ratios.argmax())]
     others = []
     for name in METHODS[:-1]:
-        ratios = np.array([_ratio(cell, name) for cell in cells])
+        ratios = np.array([cell.over_better(name) for cell in cells])
         others.append(f"{name} {percent((ratios <= 1.1).mean())} and {quantity(ratios.max())}")
     return (
         f"In {len(below)} of {len(cells)} cells α-order is below both parts, beyond chance and by more than a tenth; it is worst "
@@ -348,10 +342,6 @@ def findings(outcome: Outcome) -> list[str]:
         if left
         else []
     )
-
-
-def _ratio(cell: Cell, name: str) -> float:
-    return max(cell.error[name], 1e-300) / max(min(cell.error[FIRST_ORDER], cell.error[ZEROTH_ORDER]), 1e-300)
 
 
 def tables(outcome: Outcome) -> list[Table]:
@@ -388,12 +378,11 @@ def drawings(outcome: Outcome) -> Drawings:
             key=lambda c: c.error[FIRST_ORDER] / max(c.error[ZEROTH_ORDER], 1e-300),
         )
         for name, look in looks.items():
-            heights = [min(_ratio(cell, name), 1e4) for cell in cells]
+            heights = [min(cell.over_better(name), 1e4) for cell in cells]
             axis.plot(range(len(cells)), heights, ls="", ms=4.5 if name == ALPHA else 3.5, label=name, **look)
         axis.axhline(1, color=MUTED, lw=0.8)
-        axis.set(
-            title=f"{batch} samples", yscale="log", xlabel="problems, from first order's to zeroth order's", xticks=[]
-        )
+        axis.set(title=f"{batch} samples", yscale="log", xticks=[])
+        axis.set_xlabel("problems, from first order's to zeroth order's")
     axes[0][0].set_ylabel("squared error over that of the better part")
     axes[0][0].legend(loc="upper center", fontsize=8.5)
     caption = (

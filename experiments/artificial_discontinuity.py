@@ -26,16 +26,12 @@ from mjxgrad.stepping import Contact
 class Settings(RunSettings):
     """Outcomes along a parameter, and their gradients under noise about the largest jump."""
 
-    num_cases: Annotated[int, Field(ge=1, le=3)] = 3
-    """The first of the cases; one takes a third of the time."""
+    num_cases: Annotated[int, Field(ge=1, le=3)] = 3  # the first of the cases; one takes a third of the time
+    # Radius, or margin, that a remedy gives to edges, in m.
     rounding: Annotated[float, Field(gt=0.001, lt=0.03)] = 0.01
-    """Radius, or margin, that a remedy gives to edges, in m."""
-    length: Positive = 0.001
-    """Of the smoothing, in m."""
-    num_points: Annotated[int, Field(ge=32, multiple_of=16)] = 256
-    """Along the parameter, and under the noise."""
-    num_samples: Annotated[int, Field(ge=4)] = 64
-    """Rollouts of an estimate by zeroth or by α-order."""
+    length: Positive = 0.001  # of the smoothing, in m
+    num_points: Annotated[int, Field(ge=32, multiple_of=16)] = 256  # along the parameter, and under the noise
+    num_samples: Annotated[int, Field(ge=4)] = 64  # rollouts of an estimate by zeroth or by α-order
 
 
 PLAIN, ROUNDED, MARGIN = "as it is", "rounded", "margin"
@@ -212,9 +208,8 @@ def verdict(outcome: Outcome) -> str:
     """Say what each case does, and what rounding makes of it."""
     told = []
     for one in outcome.found:
-        errors = joined(
-            f"{percent(row.error)} ({row.derivative})" for row in one.rows if row.remedy in (PLAIN, "noise")
-        )
+        plain = (row for row in one.rows if row.remedy in (PLAIN, "noise"))
+        errors = joined(f"{percent(row.error)} ({row.derivative})" for row in plain)
         rounded = [row for row in one.rows if row.remedy == ROUNDED]
         own = joined(f"{percent(row.own_error)} ({row.derivative})" for row in rounded)
         told.append(

@@ -37,8 +37,8 @@ import mujoco.rollout
 import numpy as np
 
 import mjxgrad as mg
-from experiments.parallel import num_cores
 from experiments.problems import ASSETS
+from experiments.workspace import num_cores
 from mjxgrad._mjx import mjx
 from mjxgrad.tasks import scene_path
 

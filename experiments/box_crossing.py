@@ -1,5 +1,6 @@
 """The box crossing: loss against seconds of descents on a published task, beside the published engines."""
 
+import functools
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -67,11 +68,9 @@ class Outcome:
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Descend by every method from every start."""
     jax.config.update("jax_enable_compilation_cache", False)  # compilation is measured
-    methods, runs = settings.methods[: settings.sizes["num_methods"]], {}
-    with workspace.stage("descents", "methods", len(methods)) as advance_to:
-        for one in methods:
-            runs[one.label] = workspace.once(one.label, lambda one=one: _descents(one, settings.sizes["num_starts"]))
-            advance_to(len(runs))
+    methods, count = settings.methods[: settings.sizes["num_methods"]], settings.sizes["num_starts"]
+    parts = {one.label: functools.partial(_descents, one, count) for one in methods}
+    runs = dict(zip(parts, workspace.each("descents", "methods", parts), strict=True))
     task = box_crossing()
     play = jax.jit(lambda params: task.trajectory(params).qpos)
     played = [np.asarray(play(run.params)) for found in runs.values() for run in found]
@@ -110,7 +109,7 @@ def tables(outcome: Outcome) -> list[Table]:
     return [Table(columns, rows, "By start; s without compilation. Published: s to the loss beside, on an RTX 3090.")]
 
 
-def loss(outcome: Outcome):
+def drawings(outcome: Outcome) -> Drawings:
     """Draw loss and gradient norm against seconds; colours by estimator, lines by wheels and engine."""
     figure, axes = subplots(1, 2, height=5.2, width_ratios=[3, 2])
     (left, right), times = axes[0], np.geomspace(0.1, outcome.settings.seconds, 400)
@@ -131,12 +130,7 @@ def loss(outcome: Outcome):
         axis.set(xscale="log", yscale="log", xlabel="s, without compilation", title=title)
     legend_below(figure, left, 3)
     caption = "Left, of the worst start; stars are published, on an RTX 3090. Right, norms above 1e9 are at the edge."
-    return figure, "Loss against seconds", caption
-
-
-def drawings(outcome: Outcome) -> Drawings:
-    """Draw the figure."""
-    return {"loss": loss(outcome)}
+    return {"loss": (figure, "Loss against seconds", caption)}
 
 
 def video(outcome: Outcome, workspace: Workspace, wanted: VideoSettings) -> tuple[str | None, str]:

@@ -34,51 +34,32 @@ _EVALUATIONS = 60  # how often along a descent the true cost is measured
 class MethodSettings(SettingsTable):
     """One way to descend, from one start; the reach of all but proximity shrinks on the way."""
 
-    label: str
-    """In legends and tables."""
-    estimator: Literal["first_order", "zeroth_order", "alpha_order"] = "first_order"
-    """Of `mjxgrad.estimators`."""
-    gradient: Literal["discrete", "slope"] = "slope"
-    """Derivative of the steps."""
-    start: Finite = 0.0
-    """Control of the start, constant along each axis."""
-    stddev: Positive = 1e-6
-    """Of the noise on each control at the start; the default is none to speak of."""
-    final_noise: Annotated[float, Field(gt=0, le=1)] = 0.02
-    """Share of the noise that is left in the end."""
-    num_samples: Several = 2
-    """Rollouts per step."""
-    proximity: Positive | None = None
-    """Price of the mean squared distance, in distances at the start."""
-    radius: Positive | None = None
-    """By what the driven body is larger at the start, in m."""
-    margin: Positive | None = None
-    """By what the contact begins earlier at the start, in m."""
-    length: Positive | None = None
-    """Of the noise on the distance that the solver averages over at the start, in m."""
-    mode: Literal["forward", "backward"] = "forward"
-    """Whether the motion is averaged, too, or its derivative alone."""
+    label: str  # in legends and tables
+    estimator: Literal["first_order", "zeroth_order", "alpha_order"] = "first_order"  # of `mjxgrad.estimators`
+    gradient: Literal["discrete", "slope"] = "slope"  # derivative of the steps
+    start: Finite = 0.0  # control of the start, constant along each axis
+    stddev: Positive = 1e-6  # of the noise on each control at the start; the default is none to speak of
+    final_noise: Annotated[float, Field(gt=0, le=1)] = 0.02  # share of the noise that is left in the end
+    num_samples: Several = 2  # rollouts per step
+    proximity: Positive | None = None  # price of the mean squared distance, in distances at the start
+    radius: Positive | None = None  # by what the driven body is larger at the start, in m
+    margin: Positive | None = None  # by what the contact begins earlier at the start, in m
+    length: Positive | None = None  # of the noise on the distance that the solver averages over at the start, in m
+    mode: Literal["forward", "backward"] = "forward"  # whether the motion is averaged, too, or its derivative alone
 
 
 class Settings(RunSettings):
     """Cost against steps and rollouts of several descents on the same task."""
 
-    task: TaskName
-    """What is to be moved by what does not touch it."""
-    methods: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
-    """In the order of the legend."""
-    size: Literal["quick", "default"] = "default"
-    """The quick size takes the first three methods alone."""
-    num_steps: Annotated[int, Field(ge=10)] = 80
-    """Of each descent."""
-    learning_rate: Positive = 0.1
-    """Of Adam at the start."""
+    task: TaskName  # what is to be moved by what does not touch it
+    methods: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]  # in the order of the legend
+    size: Literal["quick", "default"] = "default"  # the quick size takes the first three methods alone
+    num_steps: Annotated[int, Field(ge=10)] = 80  # of each descent
+    learning_rate: Positive = 0.1  # of Adam at the start
+    # Share of the learning rate that is left in the end, along a cosine.
     final_rate: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Share of the learning rate that is left in the end, along a cosine."""
-    solved_below: Positive
-    """Cost that counts as solved."""
-    video: VideoSettings | None = None
-    """Of the worst end and the best; without it, none is made."""
+    solved_below: Positive  # cost that counts as solved
+    video: VideoSettings | None = None  # of the worst end and the best; without it, none is made
 
 
 @dataclass(frozen=True)

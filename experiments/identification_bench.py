@@ -24,6 +24,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import cyclopts
@@ -38,6 +39,7 @@ import mjxgrad as mg
 from experiments.benchmarks import announce
 from mjxgrad import identification
 
+_FOLDER = Path(__file__).parent / "problems"
 _NUM_STEPS = 100
 _NOISE = 1e-3  # rad
 _NOMINAL = {"armature": 0.02, "damping": 0.1, "mass": 0.5}  # kg m², N m s/rad, kg
@@ -93,7 +95,7 @@ def problem(num_parameters: int, num_windows: int) -> Problem:
     spec = _chain(num_joints)
     truth = spec.copy()
     for kind, joint in unknown:
-        _set(truth, kind, joint, _NOMINAL[kind] * random.uniform(0.5, 1.5))
+        _write(truth, kind, _element(kind, joint), _NOMINAL[kind] * random.uniform(0.5, 1.5))
     model, shape = truth.compile(), (num_windows, num_joints)
     moving = [0.5 * random.normal(size=shape), random.normal(size=shape)]  # rad, rad/s
     starts = np.concatenate([np.zeros((num_windows, 1)), *moving], axis=1)
@@ -117,36 +119,59 @@ def _chain(num_joints: int) -> Any:
         body.add_geom(name=f"link{i}", **capsule)
         spec.add_actuator(name=f"motor{i}", target=f"joint{i}", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         for kind, value in _NOMINAL.items():
-            _set(spec, kind, i, value)
+            _write(spec, kind, _element(kind, i), value)
     return spec
 
 
-def _set(spec: Any, kind: str, joint: int, value: float) -> None:
-    if kind == "mass":
-        spec.geom(f"link{joint}").mass = value
-    elif kind == "damping":
-        spec.joint(f"joint{joint}").damping[0] = value
-    else:
-        spec.joint(f"joint{joint}").armature = value
+def _element(kind: str, joint: int) -> str:
+    """Name the element of the chain that has a kind of number."""
+    return f"link{joint}" if kind == "mass" else f"joint{joint}"
 
 
-def solve_theirs(given: Problem) -> Answer:
-    """Return the answer of `mujoco.sysid`."""
-    spec = given.spec.copy()
-    model = spec.compile()
-    names = [(f"joint{i}_qpos", sysid.SignalType.MjStateQPos) for i in range(model.nv)]
-    controls = [sysid.TimeSeries(given.times, one) for one in given.controls]
-    measured = [sysid.TimeSeries.from_names(given.times[1:], one, model, names) for one in given.measured]
-    windows = [f"window{i}" for i in range(len(controls))]
-    sequences = sysid.ModelSequences("chain", spec, windows, list(given.starts), controls, measured, True)
-    parameters = sysid.ParameterDict()
-    for kind, joint in given.unknown:
+# Where a specification has a number that is named as for `mg.identify`: kinds of elements, fields, entries of arrays, and signs.
+_PLACES: dict[str, tuple[tuple[str, str, int | None, float], ...]] = {
+    "mass": (("geom", "mass", None, 1.0),),
+    "damping": (("joint", "damping", 0, 1.0),),
+    "armature": (("joint", "armature", None, 1.0),),
+    "friction_loss": (("joint", "frictionloss", None, 1.0),),
+    "jnt_stiffness": (("joint", "stiffness", 0, 1.0),),
+    "gear": (("actuator", "gear", 0, 1.0),),
+    "gain": (("actuator", "gainprm", 0, 1.0), ("actuator", "biasprm", 1, -1.0)),
+    "body_ipos": (("geom", "fromto", 0, 1.0), ("geom", "fromto", 3, 1.0)),  # of a capsule along another axis
+    "body_pos": (("body", "pos", 2, 1.0),),
+}
 
-        def write(spec: Any, parameter: Any, kind: str = kind, joint: int = joint) -> None:
-            _set(spec, kind, joint, parameter.value[0])
 
-        low, high = (_NOMINAL[kind] * bound for bound in _BOUNDS)
-        parameters.add(sysid.Parameter(f"{kind}{joint}", _NOMINAL[kind], low, high, modifier=write))
+def _write(spec: Any, kind: str, name: str, value: float) -> None:
+    """Write a number of an element into a specification; friction is that of all geoms."""
+    if kind == "friction":
+        for geom in spec.geoms:
+            geom.friction[0] = value
+        return
+    for of, field, column, sign in _PLACES[kind]:
+        element = getattr(spec, of)(name)
+        if column is None:
+            setattr(element, field, sign * value)
+        else:
+            getattr(element, field)[column] = sign * value
+
+
+def _by_sysid(
+    spec: Any, starts: Any, times: np.ndarray, controls: Any, measured: Any, unknown: dict[str, tuple]
+) -> tuple[Any, np.ndarray, float]:
+    """Return the record of `mujoco.sysid` of numbers (kind, element, nominal, bounds), half widths of intervals, and seconds."""
+    model, parameters = spec.compile(), sysid.ParameterDict()
+    names = [(f"{model.joint(i).name}_qpos", sysid.SignalType.MjStateQPos) for i in range(model.nv)]
+    given = [sysid.TimeSeries(times, one) for one in controls]
+    seen = [sysid.TimeSeries.from_names(times[1:], one, model, names) for one in measured]
+    windows = [f"window{i}" for i in range(len(given))]
+    sequences = sysid.ModelSequences("model", spec, windows, list(starts), given, seen, True)
+    for label, (kind, name, *numbers) in unknown.items():
+
+        def write(spec: Any, parameter: Any, kind: str = kind, name: str = name) -> None:
+            _write(spec, kind, name, parameter.value[0])
+
+        parameters.add(sysid.Parameter(label, *numbers, modifier=write))
     residual = sysid.build_residual_fn(models_sequences=[sequences])
     begin = time.perf_counter()
     # The intervals need the last derivative, which is kept only where each step is printed.
@@ -154,17 +179,24 @@ def solve_theirs(given: Problem) -> Answer:
         _, found = sysid.optimize(parameters, residual, verbose=False, **_THEIRS)
     left, _, _ = residual(found.x, parameters, return_pred_all=True)
     _, half_width = sysid.calculate_intervals(left, found.jac)
-    seconds = time.perf_counter() - begin
+    return found, half_width, time.perf_counter() - begin
+
+
+def solve_theirs(given: Problem) -> Answer:
+    """Return the answer of `mujoco.sysid`."""
+    unknown = {}
+    for kind, joint in given.unknown:
+        numbers = _NOMINAL[kind] * np.array([1.0, *_BOUNDS])
+        unknown[f"{kind}{joint}"] = (kind, _element(kind, joint), *numbers.tolist())
+    observed = given.starts, given.times, given.controls, given.measured
+    found, half_width, seconds = _by_sysid(given.spec.copy(), *observed, unknown)
     return Answer(found.x, half_width, len(found.extras["objective"]) - 1, seconds, seconds)
 
 
 def solve_ours(given: Problem) -> Answer:
     """Return the answer of `mg.identify`."""
     scene = mg.load_scene(given.spec.compile())
-    unknown = {
-        f"{kind}{i}": getattr(identification, kind)(scene, f"link{i}" if kind == "mass" else f"joint{i}")
-        for kind, i in given.unknown
-    }
+    unknown = {f"{kind}{i}": getattr(identification, kind)(scene, _element(kind, i)) for kind, i in given.unknown}
     recordings = []
     for start, controls, measured in zip(given.starts, given.controls, given.measured, strict=True):
         qpos, qvel = np.split(start[1:], 2)
@@ -208,14 +240,18 @@ def _print(case: tuple[int, int], row: Row) -> None:
 
 
 class Robot(NamedTuple):
-    """A robot, the place at which its joints start, its controls, and ten numbers: for `mg.identify`, and in an `MjSpec`."""
+    """A robot's file, the place at which its joints start, its controls, and ten numbers by the arguments of `identification`."""
 
-    xml: str
+    file: Path
     start: tuple[float, ...]
     drive: Callable[[np.random.Generator, np.ndarray], np.ndarray]
     num_steps: int
-    ours: dict[str, tuple[Any, ...]]
-    theirs: dict[str, Callable[[Any, float], None]]
+    numbers: dict[str, tuple[Any, ...]]
+
+    def place(self, number: str) -> tuple[str, str]:
+        """Return the kind of a number, as `_write` has it, and the name of its element."""
+        kind, *names = (one for one in self.numbers[number] if isinstance(one, str) and one != "number")
+        return kind, next(iter(names), "")
 
 
 def _sled_drive(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
@@ -229,42 +265,13 @@ def _leg_drive(rng: np.random.Generator, times: np.ndarray) -> np.ndarray:
     return (0.45, -0.9) + size * (1, 1.5) * (np.sin(rate * times[:, None] + phase) - np.sin(phase))
 
 
-def _to(kind: str, name: str, field: str, *columns: tuple[int, float]) -> Callable[[Any, float], None]:
-    """Return a function that writes a number into a specification, at columns with a sign."""
-
-    def write(spec: Any, value: float) -> None:
-        element = getattr(spec, kind)(name)
-        if not columns:
-            setattr(element, field, value)
-        for column, sign in columns:
-            getattr(element, field)[column] = sign * value
-
-    return write
-
-
-def _to_friction(spec: Any, value: float) -> None:
-    for geom in spec.geoms:
-        geom.friction[0] = value
-
-
-def _to_gains(spec: Any, value: float) -> None:
-    _to("actuator", "thigh", "gainprm", (0, 1.0))(spec, value)
-    _to("actuator", "thigh", "biasprm", (1, -1.0))(spec, value)
-
-
 _KP = lambda model, value: {  # noqa: E731
     "actuator_gainprm": model.actuator_gainprm.at[0, 0].set(value),
     "actuator_biasprm": model.actuator_biasprm.at[0, 1].set(-value),
 }
 ROBOTS = {
     "sled": Robot(
-        """<mujoco><option timestep="0.004"/><worldbody><geom name="floor" type="plane" size="5 5 .1" friction=".5"/>
-          <body name="sled" pos="0 0 .05"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
-          <joint name="z" type="slide" axis="0 0 1"/><geom name="sled" type="box" size=".12 .08 .05" mass="2" friction=".5"/>
-          <body name="pole" pos="0 0 .05"><joint name="hinge" axis="0 1 0" damping=".1" armature=".01" frictionloss=".05"
-          stiffness=".5"/><geom name="pole" type="capsule" fromto="0 0 0 0 0 .5" size=".02" mass=".3" contype="0"
-          conaffinity="0"/></body></body></worldbody><actuator><motor name="push" joint="x" gear="30"/>
-          <motor name="swing" joint="hinge" gear="2"/></actuator></mujoco>""",
+        _FOLDER / "sled.xml",
         (0.0, 0.0, 0.0),
         _sled_drive,
         300,
@@ -280,30 +287,9 @@ ROBOTS = {
             "spring": ("number", "jnt_stiffness", "hinge"),
             "place of the centre": ("number", "body_ipos", "pole", 0, (-0.05, 0.05)),
         },
-        {
-            "friction": _to_friction,
-            "mass": _to("geom", "sled", "mass"),
-            "damping": _to("joint", "hinge", "damping", (0, 1.0)),
-            "armature": _to("joint", "hinge", "armature"),
-            "gear": _to("actuator", "push", "gear", (0, 1.0)),
-            "gear of swing": _to("actuator", "swing", "gear", (0, 1.0)),
-            "friction loss": _to("joint", "hinge", "frictionloss"),
-            "damping of x": _to("joint", "x", "damping", (0, 1.0)),
-            "spring": _to("joint", "hinge", "stiffness", (0, 1.0)),
-            "place of the centre": _to("geom", "pole", "fromto", (0, 1.0), (3, 1.0)),
-        },
     ),
     "leg": Robot(
-        """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="5 5 .1" friction=".8"/>
-          <body name="hip" pos="0 0 .36"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
-          <joint name="z" type="slide" axis="0 0 1"/><geom name="hip" type="box" size=".08 .05 .05" mass="3" contype="0"
-          conaffinity="0"/><body name="thigh"><joint name="thigh" axis="0 1 0" damping=".2" armature=".01"
-          frictionloss=".1"/><geom name="thigh" type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".8" contype="0"
-          conaffinity="0"/><body name="shank" pos="0 0 -.2"><joint name="knee" axis="0 1 0" damping=".2" armature=".01"
-          frictionloss=".1"/><geom name="shank" type="capsule" fromto="0 0 0 0 0 -.2" size=".015" mass=".4" contype="0"
-          conaffinity="0"/><geom name="foot" pos="0 0 -.2" size=".025" mass=".05" friction=".8"/></body></body></body>
-          </worldbody><actuator><position name="thigh" joint="thigh" kp="60" kv="1"/>
-          <position name="knee" joint="knee" kp="60" kv="1"/></actuator></mujoco>""",
+        _FOLDER / "leg.xml",
         (0.0, 0.0, 0.45, -0.9),
         _leg_drive,
         400,
@@ -314,22 +300,10 @@ ROBOTS = {
             "armature of the thigh": ("armature", "thigh"),
             "damping": ("damping", "knee"),
             "armature": ("armature", "knee"),
-            "gain": (_KP, 60.0),
+            "gain": ("gain", "thigh"),
             "friction loss": ("friction_loss", "knee"),
             "friction loss of the thigh": ("friction_loss", "thigh"),
             "length": ("number", "body_pos", "shank", 2, (-0.3, -0.1)),
-        },
-        {
-            "friction": _to_friction,
-            "mass of the hip": _to("geom", "hip", "mass"),
-            "mass of the thigh": _to("geom", "thigh", "mass"),
-            "armature of the thigh": _to("joint", "thigh", "armature"),
-            "damping": _to("joint", "knee", "damping", (0, 1.0)),
-            "armature": _to("joint", "knee", "armature"),
-            "gain": _to_gains,
-            "friction loss": _to("joint", "knee", "frictionloss"),
-            "friction loss of the thigh": _to("joint", "thigh", "frictionloss"),
-            "length": _to("body", "shank", "pos", (2, 1.0)),
         },
     ),
 }
@@ -346,12 +320,11 @@ class Set(NamedTuple):
 
 def recorded(robot: Robot, seed: int, count: int = 5) -> Set:
     """Return recordings of a robot whose numbers are 30 % off, give or take: joints to 1 mm and 1 mrad, the first row, too."""
-    scene, rng = mg.load_scene(robot.xml, keep_everything=True), np.random.default_rng(seed)
+    scene, rng = mg.load_scene(robot.file, keep_everything=True), np.random.default_rng(seed)
     parameters, truth = {}, {}
-    for name, (kind, *arguments) in robot.ours.items():
-        if callable(kind):
-            (nominal,) = arguments
-            made = identification.Parameter(nominal, nominal / 10, 10 * nominal, kind)  # pyright: ignore[reportArgumentType]
+    for name, (kind, *arguments) in robot.numbers.items():
+        if kind == "gain":
+            made = identification.Parameter(60.0, 6.0, 600.0, _KP)
         else:
             names = [one for one in arguments if isinstance(one, str)]
             given = dict(zip(("column", "bounds"), arguments[len(names) :], strict=False))
@@ -359,9 +332,9 @@ def recorded(robot: Robot, seed: int, count: int = 5) -> Set:
         parameters[name] = made
         off = rng.uniform(-0.3, 0.3)
         truth[name] = float(made.nominal) * np.exp(off) if made.nominal else off * float(made.upper)
-    spec = mujoco.MjSpec.from_string(robot.xml)
+    spec = mujoco.MjSpec.from_file(str(robot.file))
     for name, value in truth.items():
-        robot.theirs[name](spec, value)
+        _write(spec, *robot.place(name), value)
     model, recordings = spec.compile(), []
     for _ in range(count):
         data, controls = mujoco.MjData(model), robot.drive(rng, model.opt.timestep * np.arange(robot.num_steps))
@@ -377,11 +350,10 @@ def recorded(robot: Robot, seed: int, count: int = 5) -> Set:
 
 
 class Verdict(NamedTuple):
-    """Errors in half widths of the 95 % intervals, half widths over the values, residuals over the noise, and seconds."""
+    """Errors in half widths of the 95 % intervals, half widths over the values, and seconds."""
 
     errors: np.ndarray
     widths: np.ndarray
-    rms: float
     seconds: float
 
 
@@ -394,38 +366,23 @@ def judge(given: Set) -> Verdict:
     values, halves = (
         np.array([float(part[name]) for name in given.truth]) for part in (found.values, found.half_width)
     )
-    return Verdict((values - truth) / halves, halves / np.abs(truth), found.rms[1], seconds)
+    return Verdict((values - truth) / halves, halves / np.abs(truth), seconds)
 
 
 def judge_theirs(robot: Robot, given: Set) -> Verdict:
     """Return the verdict on `mujoco.sysid`, whose starts are the first rows, at rest."""
-    spec = mujoco.MjSpec.from_string(robot.xml)
-    model = spec.compile()
-    names = [(f"{model.joint(i).name}_qpos", sysid.SignalType.MjStateQPos) for i in range(model.nv)]
-    times = model.opt.timestep * np.arange(robot.num_steps + 1)
-    starts = [np.concatenate([[0.0], one.measured["qpos"][0], np.zeros(model.nv)]) for one in given.recordings]
-    controls = [sysid.TimeSeries(times, np.vstack([one.controls, one.controls[-1:]])) for one in given.recordings]
-    measured = [
-        sysid.TimeSeries.from_names(times[1:], one.measured["qpos"][1:], model, names) for one in given.recordings
-    ]
-    windows = [f"recording{i}" for i in range(len(starts))]
-    sequences = sysid.ModelSequences("robot", spec, windows, starts, controls, measured, True)
-    unknown = sysid.ParameterDict()
-    for name, part in given.parameters.items():
-
-        def write(spec: Any, parameter: Any, name: str = name) -> None:
-            robot.theirs[name](spec, parameter.value[0])
-
-        bounds = float(part.lower), float(part.upper)
-        unknown.add(sysid.Parameter(name, float(part.nominal), *bounds, modifier=write))
-    residual = sysid.build_residual_fn(models_sequences=[sequences])
-    begin = time.perf_counter()
-    with contextlib.redirect_stdout(io.StringIO()):
-        _, found = sysid.optimize(unknown, residual, verbose=False, **_THEIRS)
-    left, _, _ = residual(found.x, unknown, return_pred_all=True)
-    _, half = sysid.calculate_intervals(left, found.jac)
-    seconds, truth = time.perf_counter() - begin, np.array(list(given.truth.values()))
-    return Verdict((found.x - truth) / half, half / np.abs(truth), float("nan"), seconds)
+    spec = mujoco.MjSpec.from_file(str(robot.file))
+    times = spec.option.timestep * np.arange(robot.num_steps + 1)
+    starts = [np.pad(one.measured["qpos"][0], (1, len(robot.start))) for one in given.recordings]
+    controls = [np.vstack([one.controls, one.controls[-1:]]) for one in given.recordings]
+    measured = [one.measured["qpos"][1:] for one in given.recordings]
+    unknown = {
+        name: (*robot.place(name), *map(float, (one.nominal, one.lower, one.upper)))
+        for name, one in given.parameters.items()
+    }
+    found, half, seconds = _by_sysid(spec, starts, times, controls, measured, unknown)
+    truth = np.array(list(given.truth.values()))
+    return Verdict((found.x - truth) / half, half / np.abs(truth), seconds)
 
 
 def robots(sets: int, limit: float) -> None:
@@ -454,7 +411,7 @@ def robots(sets: int, limit: float) -> None:
                 f"{statistics.median(seconds):.1f} ({min(seconds):.1f} to {max(seconds):.1f}) | "
                 + ", ".join(
                     f"{key} {n} ({100 * w:.2g} %)"
-                    for key, n, w in zip(robot.ours, held.sum(axis=0), widths, strict=True)
+                    for key, n, w in zip(robot.numbers, held.sum(axis=0), widths, strict=True)
                 )
                 + " |",
                 flush=True,

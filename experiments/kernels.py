@@ -13,14 +13,13 @@ from pydantic import Field
 from scipy import stats
 
 import mjxgrad as mg
-from experiments.parallel import in_threads
 from experiments.problems.planar_pusher import planar_pusher
 from experiments.report import Table
 from experiments.settings import Positive, RunSettings
 from experiments.theme import FIRST, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, subplots
 from experiments.words import joined, quantity
-from experiments.workspace import Workspace
-from mjxgrad.planning import Analytic, GoalCost, optimise_trajectory
+from experiments.workspace import Workspace, in_threads
+from mjxgrad.planning import Analytic, optimise_trajectory
 
 _SIZE = np.sqrt(2 / np.pi)  # mean |w| of all kernels, in lengths
 # Name, colour and distribution by kernel. The distributions are scipy's, not the library's: samples are drawn from them.
@@ -44,14 +43,11 @@ _plan = eqx.filter_jit(optimise_trajectory)
 class Settings(RunSettings):
     """A ball above a floor, and a rod that a finger is to push, under each kernel."""
 
-    length: Positive
-    """Length of the noise under the ball (m)."""
-    num_samples: Annotated[int, Field(ge=100)]
-    """Samples of the noise for each mean of forces."""
-    gaps: tuple[Positive, ...]
-    """Gaps between finger and rod at the start of a push (m)."""
+    length: Positive  # length of the noise under the ball (m)
+    num_samples: Annotated[int, Field(ge=100)]  # samples of the noise for each mean of forces
+    gaps: tuple[Positive, ...]  # gaps between finger and rod at the start of a push (m)
+    # The quick size takes a tenth of the samples, and the first two gaps.
     size: Literal["quick", "default"] = "default"
-    """The quick size takes a tenth of the samples, and the first two gaps."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +130,8 @@ def _means(settings: Settings, name: str, forces: np.ndarray) -> np.ndarray:
 
 def _miss(name: str, gap: float) -> float:
     """Plan a push from rest while the smoothing vanishes, and return how far from its goal the rod ends (m)."""
-    task, weight = planar_pusher((0.0, -0.04 - gap), _GOAL), jnp.array((0, 0, 1, 1, 0.03, 0, 0, 0, 0, 0))
-    problem = task.system, GoalCost(task.goal, 0.3 * weight, 100 * weight, 0.02), task.start, jnp.zeros((25, 2))
+    task = planar_pusher((0.0, -0.04 - gap), _GOAL)
+    problem = task.system, task.cost, task.start, jnp.zeros((25, 2))
     smoother = Analytic(mg.Smoothing(_PUSH_LENGTH, kernel=name))
     end = _plan(*problem, jax.random.key(0), smoother=smoother, schedule=np.geomspace(1, 0.02, 40)).states[-1]
     return float(jnp.linalg.norm(end[2:4] - jnp.asarray(_GOAL[:2])))

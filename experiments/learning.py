@@ -19,10 +19,10 @@ from experiments.problems.pusher import pusher
 from experiments.problems.quadruped import quadruped
 from experiments.problems.trot import apg, trot
 from experiments.report import MOST_WORDS, Table
-from experiments.settings import Positive, RunSettings, SettingsTable, VideoSettings
+from experiments.settings import Positive, SettingsTable, SizedSettings, VideoSettings
 from experiments.theme import FIRST, ONSET, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.video import film, shown_speed, with_coarse_shadows
-from experiments.words import capitalised, joined, named, quantity
+from experiments.words import capitalised, counted, joined, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
@@ -50,47 +50,36 @@ _FINER = 8  # times, by which time steps are shorter where a policy is judged a 
 class Sizes(SettingsTable):
     """How much is spent."""
 
-    num_seeds: Annotated[int, Field(ge=1)]
-    """Policies per method, learned side by side."""
-    num_updates: Annotated[int, Field(ge=2)]
-    """Of each policy."""
-    num_environments: Annotated[int, Field(ge=2)] = 64
-    """Of each policy."""
-    num_episodes: Annotated[int, Field(ge=1)] = 16
-    """Of each policy in C MuJoCo, by which it is judged."""
+    num_seeds: Annotated[int, Field(ge=1)]  # policies per method, learned side by side
+    num_updates: Annotated[int, Field(ge=2)]  # of each policy
+    num_environments: Annotated[int, Field(ge=2)] = 64  # of each policy
+    num_episodes: Annotated[int, Field(ge=1)] = 16  # of each policy in C MuJoCo, by which it is judged
+    # Factor of the steps that PPO takes: three times as many last about as long as those of the others.
     ppo_steps: Positive = 1.0
-    """Factor of the steps that PPO takes: three times as many last about as long as those of the others."""
 
 
-class Settings(RunSettings):
+class Settings(SizedSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
+    # What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, or the trot of MuJoCo's notebook.
     environment: Name
-    """What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, or the trot of MuJoCo's notebook."""
+    # SHAC, or analytic policy gradients as in brax: no value function, other networks and rates.
     algorithm: Literal["shac", "apg"] = "shac"
-    """SHAC, or analytic policy gradients as in brax: no value function, other networks and rates."""
-    methods: Annotated[tuple[Method, ...], Field(min_length=1)]
-    """Which gradients learn; PPO is brax's."""
+    methods: Annotated[tuple[Method, ...], Field(min_length=1)]  # which gradients learn; PPO is brax's
+    # By which contact is stiffer than in the scene.
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
-    """By which contact is stiffer than in the scene."""
+    # Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, pusher, quadruped and trot have their own.
     num_substeps: Annotated[int, Field(ge=1)] | None = None
-    """Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, pusher, quadruped and trot have their own."""
-    window: Annotated[int, Field(ge=1)] = learning.Settings.window
-    """Steps of each environment per update."""
-    actor_rate: Positive | None = None
-    """Learning rate of the policy; if left out, the algorithm's."""
+    window: Annotated[int, Field(ge=1)] = learning.Settings.window  # steps of each environment per update
+    actor_rate: Positive | None = None  # learning rate of the policy; if left out, the algorithm's
+    # Standard deviations of the noise on actions at the beginning and at the end; if left out, the algorithm's.
     stddev: tuple[Positive, Positive] | None = None
-    """Standard deviations of the noise on actions at the beginning and at the end; if left out, the algorithm's."""
+    # λ of the returns that a policy climbs; below 1 derivatives reach less far.
     trace: Annotated[float, Field(ge=0, le=1)] = learning.Settings.trace
-    """λ of the returns that a policy climbs; below 1 derivatives reach less far."""
+    # Longer first-order gradients are shortened to it; in units of zeroth-order noise.
     largest_sample: Positive = learning.Settings.largest_sample
-    """Longer first-order gradients are shortened to it; in units of zeroth-order noise."""
-    size: Literal["quick", "default", "full"] = "default"
-    """How much is spent."""
     sizes: Sizes
-    """The numbers that go with the size: those of the file's table of that name."""
-    video: VideoSettings | None = None
-    """Of the best policy."""
+    video: VideoSettings | None = None  # of the best policy
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
@@ -189,18 +178,14 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Learn by every method at every stiffness."""
     if "ppo" in settings.methods:
         ppo.load()  # or say at once that it is not there
-    environment = _environment(settings)
+    substeps = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
+    environment = _LOADERS[settings.environment](**substeps)
     workspace.check(environment.scene)
     courses, each = [], settings.sizes.num_updates
     with workspace.stage("learning", "updates", len(settings.methods) * each) as advance_to:
         for number, method in enumerate(settings.methods):
             courses += _courses(settings, workspace, environment, method, lambda n, b=number * each: advance_to(b + n))
     return Outcome(settings, courses, environment)
-
-
-def _environment(settings: Settings) -> Environment:
-    substeps = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
-    return _LOADERS[settings.environment](**substeps)
 
 
 def _courses(
@@ -228,15 +213,9 @@ def _courses(
             log_every=_every(settings),
             checkpoint=workspace.keep(method),
         )
-        history = {name: np.asarray(values) for name, values in found.history.items()}
-        learned = [
-            (
-                jax.tree.map(lambda x, i=i: x[i], found.policy),
-                operator.call,
-                {name: x[:, i] for name, x in history.items()},
-            )
-            for i in range(len(factors))
-        ]
+        policies = [jax.tree.map(lambda x, i=i: x[i], found.policy) for i in range(len(factors))]
+        histories = [{k: np.asarray(x)[:, i] for k, x in found.history.items()} for i in range(len(factors))]
+        learned = [(one, operator.call, history) for one, history in zip(policies, histories, strict=True)]
     return [
         _judged_course(settings, one, method, k, *each)
         for one, k, each in zip(environments, factors, learned, strict=True)
@@ -262,12 +241,11 @@ def _by_ppo(
         seconds += course["seconds"][-1]
         rewards.append(np.interp(each * np.arange(1, num_updates + 1), course["steps"], course["reward"]))
     reward = np.stack(rewards, axis=1)
-    known = {"reward": reward, "seconds": np.full_like(reward, seconds / num_updates)}
-    counts = {name: np.zeros_like(reward) for name in ("not_finite", "skipped", "diverged", "shortened")}
-    unknown = {
-        name: np.full_like(reward, np.nan) for name in ("alpha", "agreement", "first_variance", "zeroth_variance")
-    }
-    return jax.tree.map(lambda *x: jnp.stack(x), *learned), acts[0], {**known, **counts, **unknown}
+    history = {"reward": reward, "seconds": np.full_like(reward, seconds / num_updates)}
+    history |= dict.fromkeys(("not_finite", "skipped", "diverged", "shortened"), np.zeros_like(reward))
+    unknown = ("alpha", "agreement", "first_variance", "zeroth_variance")
+    history |= dict.fromkeys(unknown, np.full_like(reward, np.nan))
+    return jax.tree.map(lambda *x: jnp.stack(x), *learned), acts[0], history
 
 
 def _judged_course(
@@ -373,7 +351,7 @@ def answer(outcome: Outcome) -> str:
     second, p_value = outcome.runner_up
     if p_value <= 0.05:
         return f"{told}."
-    count = _counted(best.judged.size, "seed", "seeds")
+    count = counted(best.judged.size, "seed", "seeds")
     doubt = f"{told}; {count} cannot tell it from {NAMES[second.method]}."
     return doubt if len(doubt.split()) <= MOST_WORDS else f"{told} (unproven)."
 
@@ -479,7 +457,7 @@ def course_of_learning(outcome: Outcome):
             axis.plot(scale * updates, course.reward, lw=0.6, alpha=0.4, **look)
             axis.plot(scale * updates, course.reward.mean(axis=1), lw=2, label=label, **look)
     axes[0, 0].set(title="By steps", xlabel="steps of each policy", ylabel="reward per step")
-    policies = _counted(settings.sizes.num_seeds * len(settings.stiffness), "policy", "policies")
+    policies = counted(settings.sizes.num_seeds * len(settings.stiffness), "policy", "policies")
     axes[0, 1].set(title="By time", xlabel=f"seconds for {policies}, without compilation")
     for axis in axes[0]:
         plain(axis.yaxis)
@@ -489,7 +467,7 @@ def course_of_learning(outcome: Outcome):
     axes[0, 0].set_ylim(np.quantile(ends, 0.01) - 0.1 * np.ptp(ends), ends.max() + 0.05 * np.ptp(ends))
     legend_below(figure, axes[0, 0], 3)
     caption = (
-        f"Mean reward per step over ten updates; thin, each of {_counted(settings.sizes.num_seeds, 'seed', 'seeds')}, thick "
+        f"Mean reward per step over ten updates; thin, each of {counted(settings.sizes.num_seeds, 'seed', 'seeds')}, thick "
         "their mean. Lines that coincide cover each other."
     )
     return figure, "Learning", caption
@@ -562,10 +540,6 @@ def video(outcome: Outcome, workspace: Workspace, look: VideoSettings) -> tuple[
         start = jax.random.split(jax.random.key(outcome.settings.seed + 1), outcome.settings.sizes.num_episodes)[0]
         model.body("target").pos[:2] = environment.reset(start).memory
     return film(workspace, [(model, shown)], look, camera=camera, caption=caption, timestep=interval)
-
-
-def _counted(number: int, one: str, several: str) -> str:
-    return f"one {one}" if number == 1 else f"{number} {several}"
 
 
 def _off_command(course: Course) -> list[Float[np.ndarray, " seeds"]]:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,10 +14,11 @@ from matplotlib.ticker import NullFormatter
 from pydantic import Field
 
 import mjxgrad as mg
+from experiments.problems import ASSETS
 from experiments.problems.comparison import over_keys
 from experiments.report import Table
 from experiments.settings import RunSettings
-from experiments.theme import FIRST, ONSET, REFERENCE, ZEROTH, Drawings, plain, subplots
+from experiments.theme import FIRST, ONSET, REFERENCE, ZEROTH, Drawings, legend_below, plain, subplots
 from experiments.words import capitalised, quantity
 from experiments.workspace import Workspace
 from mjxgrad.diagnostics.bias_variance import map_in_chunks
@@ -29,12 +29,11 @@ from mjxgrad.tasks import START_POSE, START_VELOCITY, scene_path
 class Settings(RunSettings):
     """Gradients by noisy controls against the horizon; errors are those of estimates from 16 rollouts."""
 
+    # How many rollouts and estimates; the quick size has a quarter, α at two horizons, and leaves the hopper's slope out.
     size: Literal["quick", "default"] = "default"
-    """How many rollouts and estimates; the quick size has a quarter, α at two horizons, and leaves the hopper's slope out."""
-    num_controls: Annotated[int, Field(ge=8)] = 30
-    """In time, each held for ten steps."""
+    num_controls: Annotated[int, Field(ge=8)] = 30  # in time, each held for ten steps
+    # Rollouts that are differentiated; 32 times as many are for the truth and the value function.
     num_samples: Annotated[int, Field(ge=128)] = 192
-    """Rollouts that are differentiated; 32 times as many are for the truth and the value function."""
 
     def sized(self, number: int) -> int:
         """Return a number of rollouts or estimates, or its quarter."""
@@ -67,7 +66,7 @@ class Problem:
 def problems() -> list[Problem]:
     """Return a pendulum that swings over, and a hopper that lands on springs, which hold its posture, by both derivatives."""
     pendulum = mg.load_scene(scene_path("double_pendulum"), timestep=0.01).with_engine("mujoco")
-    model = mujoco.MjModel.from_xml_path(f"{gymnasium.__path__[0]}/envs/mujoco/assets/hopper.xml")
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "hopper.xml"))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     model.jnt_stiffness[3:], model.qpos_spring[3:], model.dof_damping[3:] = 100.0, START_POSE[3:], 10.0
     hopper = mg.load_scene(model).with_engine("mujoco")
@@ -313,8 +312,7 @@ def drawings(outcome: Outcome) -> Drawings:
             )
     axes[0, 0].set_ylabel("variance of one rollout")
     axes[1, 0].set_ylabel("error over the gradient's size")
-    handles = [h for axis in axes[:, 0] for h in axis.get_legend_handles_labels()[0]]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    legend_below(figure, axes[:, 0], 5)
     caption = (
         "Above, variance of the gradient of the cost at the horizon, summed over controls, and the squared gradient itself "
         "(dotted); dashed, where first order's passes zeroth order's, with its interval. At the foot, the mean α of α-order. "

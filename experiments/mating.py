@@ -2,9 +2,9 @@
 
 import functools
 import itertools
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from timeit import timeit
 from typing import Annotated, Any
 
 import jax
@@ -31,20 +31,15 @@ from mjxgrad.tasks import scene_path
 class Settings(RunSettings):
     """Depth of a peg against its offset from the hole, its gradient, and descents on it."""
 
+    # Numbers of points that stand for the pressure.
     points: tuple[Annotated[int, Field(ge=4, multiple_of=4)], ...] = (4, 16, 64, 256)
-    """Numbers of points that stand for the pressure."""
+    # Of the hole on each side, in m; the second is that of everything else.
     clearances: tuple[Positive, ...] = (0.0005, 0.001, 0.002)
-    """Of the hole on each side, in m; the second is that of everything else."""
-    chamfer: Positive = 0.003
-    """Of the hole's rim where it has one, in m."""
-    stiffness: Positive = 4e7
-    """Of the pressure, in N/m² per m of depth."""
-    stddev: Positive = 0.0005
-    """Of the noise on the offset, in m; controls have four times as much."""
-    num_points: Annotated[int, Field(ge=32, multiple_of=16)] = 64
-    """Offsets, and rollouts of a slope."""
-    num_steps: Annotated[int, Field(ge=10)] = 30
-    """Of each descent; four seeds, 16 rollouts a step."""
+    chamfer: Positive = 0.003  # of the hole's rim where it has one, in m
+    stiffness: Positive = 4e7  # of the pressure, in N/m² per m of depth
+    stddev: Positive = 0.0005  # of the noise on the offset, in m; controls have four times as much
+    num_points: Annotated[int, Field(ge=32, multiple_of=16)] = 64  # offsets, and rollouts of a slope
+    num_steps: Annotated[int, Field(ge=10)] = 30  # of each descent; four seeds, 16 rollouts a step
 
 
 HALF = np.array([0.019, 0.04])  # m, of the peg
@@ -208,12 +203,9 @@ def _told(kind: str | int, settings: Settings, clearance: float) -> Told:
     offsets = np.linspace(*OFFSETS, count)
     depths = np.asarray(simulate(offsets))
     place = float(offsets[np.argmax(np.abs(np.diff(depths)))])
-    starts, times = place + settings.stddev * np.random.default_rng(settings.seed).normal(size=count), []
+    starts = place + settings.stddev * np.random.default_rng(settings.seed).normal(size=count)
     derivatives = np.asarray(slopes(starts))
-    for _ in range(3):
-        times.append(time.perf_counter())
-        jax.block_until_ready(slopes(starts))
-    price = (time.perf_counter() - times[0]) / len(times) / count
+    price = timeit(lambda: jax.block_until_ready(slopes(starts)), number=3) / 3 / count
     jumps = jumps_along(lambda p: np.asarray(simulate(p)), OFFSETS, num_points=count)
     slope = np.mean([secant_slope(simulate, place, settings.stddev, count, i) for i in range(8)])
     label = f"{kind} points" if isinstance(kind, int) else kind

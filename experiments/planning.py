@@ -25,7 +25,7 @@ from experiments.theme import DEFAULT, FIRST, REFERENCE, ZEROTH, Drawings, plain
 from experiments.video import film, shown_speed
 from experiments.words import capitalised
 from experiments.workspace import Workspace
-from mjxgrad.planning import GoalCost, Plan, Smoother, optimise_trajectory
+from mjxgrad.planning import Plan, Smoother, optimise_trajectory
 from mjxgrad.stepping import Smoothing
 
 Count = Annotated[int, Field(ge=1)]
@@ -35,26 +35,17 @@ NAMES = {"analytic": "analytic", "none": "no smoothing"}
 class Settings(RunSettings):
     """A rod is pushed to a pose by a finger that does not touch it at the start."""
 
+    # The linear models to compare; figures and video show the first.
     models: Annotated[tuple[Literal["analytic", "none"], ...], Field(min_length=1)] = ("analytic", "none")
-    """The linear models to compare; figures and video show the first."""
-    finger: tuple[Finite, Finite] = (0.0, -0.15)
-    """The finger's start (m)."""
-    goal: tuple[Finite, Finite, Finite]
-    """The rod's goal: x, y (m) and turn (rad); it starts at the origin."""
-    length: Positive = 0.05
-    """Smoothing of contacts at the start (m)."""
-    last_length: Positive = 0.001
-    """Smoothing of contacts in the last iterations (m)."""
-    num_iterations: Annotated[int, Field(ge=3)] = 60
-    """Iterations of trajectory optimisation."""
-    horizon: Count = 25
-    """Decisions of 0.1 s each."""
-    position_tolerance: Positive = 0.02
-    """The distance from its goal at which the rod has arrived (m)."""
-    angle_tolerance: Positive = 0.15
-    """The same for its turn (rad)."""
-    video: VideoSettings | None = None
-    """Without it, none is made."""
+    finger: tuple[Finite, Finite] = (0.0, -0.15)  # the finger's start (m)
+    goal: tuple[Finite, Finite, Finite]  # the rod's goal: x, y (m) and turn (rad); it starts at the origin
+    length: Positive = 0.05  # smoothing of contacts at the start (m)
+    last_length: Positive = 0.001  # smoothing of contacts in the last iterations (m)
+    num_iterations: Annotated[int, Field(ge=3)] = 60  # iterations of trajectory optimisation
+    horizon: Count = 25  # decisions of 0.1 s each
+    position_tolerance: Positive = 0.02  # the distance from its goal at which the rod has arrived (m)
+    angle_tolerance: Positive = 0.15  # the same for its turn (rad)
+    video: VideoSettings | None = None  # without it, none is made
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
@@ -129,12 +120,6 @@ class Outcome:
         ]
 
 
-# Weights of the rod's x, y and turn; a turn of 0.17 rad counts as much as 0.03 m.
-_ROD = (0.0, 0.0, 1.0, 1.0, 0.03, 0.0, 0.0, 0.0, 0.0, 0.0)
-_STAGE, _TERMINAL = 0.3, 100.0
-_CONTROL = 0.02  # of the squared finger speed
-
-
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Plan with every kind of linear model that is asked for."""
     task = planar_pusher(finger=settings.finger, goal=settings.goal)
@@ -151,17 +136,16 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
 
 @eqx.filter_jit
 def _optimised(task: PlanarPusher, settings: Settings, smoother: Smoother, schedule: np.ndarray) -> Plan:
-    limit, weight = task.speed_limit, jnp.array(_ROD)
     return optimise_trajectory(
         task.system,
-        GoalCost(task.goal, _STAGE * weight, _TERMINAL * weight, _CONTROL),
+        task.cost,
         task.start,
         jnp.zeros((settings.horizon, 2)),
         jax.random.key(settings.seed),
         smoother=smoother,
         schedule=schedule,
-        lower=-limit,
-        upper=limit,
+        lower=-task.speed_limit,
+        upper=task.speed_limit,
     )
 
 

@@ -46,9 +46,8 @@ def learn_ppo(
 ) -> tuple[Any, Act, dict[str, Float[np.ndarray, " readings"]]]:
     """Learn a policy from so many steps, or as many as fill a batch, with brax's numbers for a robot of that name.
 
-    Returns:
-        What was learned, how to act by it without noise, and by name: `steps` and `seconds` until a reading, compilation left
-        out, and `reward`, the mean per step of whole episodes then.
+    With what was learned goes how to act by it without noise, and by name: `steps` and `seconds` until a reading, compilation
+    left out, and `reward`, the mean per step of whole episodes then.
     """
     ppo, networks, environment_of_brax = load()
     how = _HOW | _OWN.get(name, {})

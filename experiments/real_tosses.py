@@ -28,39 +28,25 @@ from mjxgrad.identification import Parameter, Recording, Stopped
 class StartSettings(SettingsTable):
     """Where a search begins."""
 
-    side: Positive
-    """Of the cube, in m."""
-    radius: Positive
-    """Of its corners, in m."""
-    friction: Positive
-    """With the floor."""
-    stiffness: Positive
-    """Of the contact, in 1/s²."""
-    damping_ratio: Positive
-    """Of the contact."""
+    side: Positive  # of the cube, in m
+    radius: Positive  # of its corners, in m
+    friction: Positive  # with the floor
+    stiffness: Positive  # of the contact, in 1/s²
+    damping_ratio: Positive  # of the contact
 
 
 class Settings(RunSettings):
     """Parameters of a cube from recorded tosses, and what they are worth on others."""
 
-    folder: str
-    """With the tosses of ContactNets, `0.pt` and so on."""
-    num_training: Annotated[int, Field(ge=1)]
-    """Tosses to fit."""
-    num_held_out: Annotated[int, Field(ge=1)]
-    """Tosses to judge by."""
-    window: Annotated[int, Field(ge=2)]
-    """Steps of the recording that are simulated at a time."""
-    num_windows: Annotated[int, Field(ge=1)]
-    """At most, of a toss, from shortly before it touches the floor."""
-    substeps: Annotated[int, Field(ge=1)]
-    """Time steps of the simulation for each of the recording."""
-    noise: Positive
-    """Of positions, in m; of turns it is over half a side."""
-    max_steps: Annotated[int, Field(ge=1)]
-    """Of a search."""
-    start: StartSettings
-    """Of all searches."""
+    folder: str  # with the tosses of ContactNets, `0.pt` and so on
+    num_training: Annotated[int, Field(ge=1)]  # tosses to fit
+    num_held_out: Annotated[int, Field(ge=1)]  # tosses to judge by
+    window: Annotated[int, Field(ge=2)]  # steps of the recording that are simulated at a time
+    num_windows: Annotated[int, Field(ge=1)]  # at most, of a toss, from shortly before it touches the floor
+    substeps: Annotated[int, Field(ge=1)]  # time steps of the simulation for each of the recording
+    noise: Positive  # of positions, in m; of turns it is over half a side
+    max_steps: Annotated[int, Field(ge=1)]  # of a search
+    start: StartSettings  # of all searches
 
 
 # The block of Pfrommer, Halm, Posa, ContactNets, CoRL 2020, arXiv:2009.11193. Its repository, DAIRLab/contact-nets, has lengths
@@ -148,9 +134,8 @@ def cube(
 
     Cones are elliptic: edges of a pyramid push a corner that slides as soon as it touches, and derivatives chatter.
     """
-    corners = "".join(
-        f'<geom pos="{x} {y} {z}" size="{radius}"/>' for x, y, z in (_SIGNS * (side / 2 - radius)).tolist()
-    )
+    places = (_SIGNS * (side / 2 - radius)).tolist()
+    corners = "".join(f'<geom pos="{x} {y} {z}" size="{radius}"/>' for x, y, z in places)
     solref = f"{-stiffness} {-2 * damping_ratio * stiffness**0.5}"
     return mg.load_scene(f"""<mujoco model="cube"><option timestep="{1 / RATE / substeps}" cone="elliptic"/>
       <default><geom solref="{solref}" friction="{friction}"/></default>
@@ -277,14 +262,17 @@ class Outcome:
         """One row per set of numbers, for metrics.csv."""
         found = []
         for name, values in (GIVEN | {name: fit.values for name, fit in self.fits.items()}).items():
-            place, turn, early_place, early_turn = self.judged[name].T
             widths = self.fits[name].half_width if name in self.fits else {}
             ends = {f"{key}_half_width": x for key, x in widths.items()}
-            means = {"position_error": place.mean(), "position_median": np.median(place)}
-            means |= {"turn_error_degrees": turn.mean(), "turn_median_degrees": np.median(turn)}
-            means |= {"early_position_error": early_place.mean(), "early_turn_error_degrees": early_turn.mean()}
-            found.append({"name": name, **values, **means, **ends})
+            found.append({"name": name, **values, **_means(self.judged[name]), **ends})
         return found
+
+
+def _means(judged: Float[np.ndarray, "tosses 4"]) -> dict[str, float]:
+    place, turn, early_place, early_turn = judged.T
+    found = {"position_error": place.mean(), "position_median": np.median(place)}
+    found |= {"turn_error_degrees": turn.mean(), "turn_median_degrees": np.median(turn)}
+    return found | {"early_position_error": early_place.mean(), "early_turn_error_degrees": early_turn.mean()}
 
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
@@ -407,13 +395,17 @@ def tables(outcome: Outcome) -> list[Table]:
     ]
     units = f"residuals in units of {1e3 * outcome.settings.noise:g} mm"
     searched = tabulated(ends, f"The searches, over {outcome.num_windows} windows; {units}.")
-    worth = []
-    for name, judged in outcome.judged.items():
-        place, turn, early_place, early_turn = judged.T
-        cells = {"position, mean (%)": 100 * place.mean(), "median (%)": 100 * np.median(place)}
-        cells |= {"mean (mm)": 1e3 * SIDE * place.mean(), "turn, mean (°)": turn.mean(), "median (°)": np.median(turn)}
-        cells |= {"early (mm)": 1e3 * SIDE * early_place.mean(), "early (°)": early_turn.mean()}
-        worth.append({"": name} | {head: f"{x:.1f}" for head, x in cells.items()})
+    shown = (
+        ("position, mean (%)", "position_error", 100.0),
+        ("median (%)", "position_median", 100.0),
+        ("mean (mm)", "position_error", 1e3 * SIDE),
+        ("turn, mean (°)", "turn_error_degrees", 1.0),
+        ("median (°)", "turn_median_degrees", 1.0),
+        ("early (mm)", "early_position_error", 1e3 * SIDE),
+        ("early (°)", "early_turn_error_degrees", 1.0),
+    )
+    means = {name: _means(judged) for name, judged in outcome.judged.items()}
+    worth = [{"": name} | {head: f"{k * one[key]:.1f}" for head, key, k in shown} for name, one in means.items()]
     caption = (
         f"Error over {outcome.settings.num_held_out} tosses that were held out, rolled out whole from their first state in "
         "C MuJoCo: of the centre, in per cent of the published side, and of the orientation. Early: until 0.1 s after the first "

@@ -7,6 +7,7 @@ engine that cannot be installed, or lacks what a scene needs, costs its rows and
 """
 
 import functools
+import itertools
 import json
 import math
 import os
@@ -22,16 +23,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import gymnasium
 import numpy as np
 from pydantic import Field
 
-from experiments.parallel import num_cores
+from experiments.problems import ASSETS
 from experiments.report import MOST_WORDS, Table
-from experiments.settings import Positive, RunSettings, SettingsTable
+from experiments.settings import Positive, SettingsTable, SizedSettings
 from experiments.theme import MARKERS, MUTED, OTHERS, REFERENCE, ZEROTH, Drawings, plain, subplots
 from experiments.words import joined, percent, quantity
-from experiments.workspace import Workspace
+from experiments.workspace import Workspace, num_cores
 from mjxgrad.diagnostics import compare_to_slope, phases
 
 SceneName = Literal["bounce", "push", "slide", "peg", "hopper"]
@@ -47,23 +47,17 @@ _LOW, _HIGH = 1e-4, 1e2  # errors in the picture
 class Sizes(SettingsTable):
     """How much is measured."""
 
-    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)]
-    """By name."""
-    engines: Annotated[tuple[EngineName, ...], Field(min_length=1)]
-    """By name; those that are not there are installed."""
-    num_starts: Annotated[int, Field(ge=32)]
-    """At which each engine is differentiated."""
+    scenes: Annotated[tuple[SceneName, ...], Field(min_length=1)]  # by name
+    engines: Annotated[tuple[EngineName, ...], Field(min_length=1)]  # by name; those that are not there are installed
+    num_starts: Annotated[int, Field(ge=32)]  # at which each engine is differentiated
+    # Seconds of all gradients of a contestant in a scene, beyond which it is asked at fewer starts, 32 at least.
     budget: Positive
-    """Seconds of all gradients of a contestant in a scene, beyond which it is asked at fewer starts, 32 at least."""
 
 
-class Settings(RunSettings):
+class Settings(SizedSettings):
     """Error of gradients through contact against their time, by engine."""
 
-    size: Literal["quick", "default", "full"] = "default"
-    """Two scenes and what is installed anyway; all engines; the hopper, too, whose compilation takes longest."""
     sizes: Sizes
-    """The numbers that go with the size: those of the file's table of that name."""
 
 
 @dataclass(frozen=True)
@@ -132,21 +126,18 @@ class Outcome:
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Ask every contestant about every scene."""
     sizes = settings.sizes
-    cells, missing, versions = [], [], {}
     asked = {name: scene for name, scene in scenes(sizes.num_starts).items() if name in sizes.scenes}
     contestants = [(name, variant) for name in sizes.engines for variant in ENGINES[name]["variants"]]
-    with workspace.stage("contestants", "contestants", len(contestants)) as advance_to:
-        for i, one in enumerate(contestants):
-            found = workspace.once(" ".join(one), functools.partial(_judge, *one, asked, sizes.budget))
-            cells, missing, versions[one[0]] = cells + found[0], missing + found[1], found[2]
-            advance_to(i + 1)
-    return Outcome(settings, cells, list(dict.fromkeys(missing)), versions, _machine())
+    parts = {" ".join(one): functools.partial(_judge, *one, asked, sizes.budget) for one in contestants}
+    cells, missing, told = zip(*workspace.each("contestants", "contestants", parts), strict=True)
+    versions = {name: version for (name, _), version in zip(contestants, told, strict=True)}
+    gathered = list(itertools.chain(*cells)), list(dict.fromkeys(itertools.chain(*missing)))
+    return Outcome(settings, *gathered, versions, _machine())
 
 
 def scenes(num_starts: int) -> dict[str, dict[str, Any]]:
     """Return the scenes, with the values at which each is simulated."""
-    hopper = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
-    own = {"hopper": {"xml": hopper.read_text(encoding="utf-8")}}
+    own = {"hopper": {"xml": (ASSETS / "hopper.xml").read_text(encoding="utf-8")}}
     values = {name: phases(tuple(scene["interval"]), num_starts).tolist() for name, scene in SCENES.items()}
     return {name: scene | own.get(name, {}) | {"name": name, "values": values[name]} for name, scene in SCENES.items()}
 
@@ -277,12 +268,7 @@ def tables(outcome: Outcome) -> list[Table]:
 
 
 def drawings(outcome: Outcome) -> Drawings:
-    """Draw the figure."""
-    return {"error_against_time": error_against_time(outcome)}
-
-
-def error_against_time(outcome: Outcome):
-    """Error of the mean derivative against seconds of one gradient, a panel per scene."""
+    """Draw the error of the mean derivative against seconds of one gradient, a panel per scene."""
     names = outcome.settings.sizes.scenes
     figure, axes = subplots(rows := len(names) // 3 + 1, 3, height=3.5 * rows, sharex=True, sharey=True)
     colours = dict(zip(ENGINES, (REFERENCE, ZEROTH, *OTHERS), strict=False))
@@ -306,4 +292,4 @@ def error_against_time(outcome: Outcome):
         "Lower and further left is better; below the dashed line is right within a tenth. Errors above 100 and gradients that "
         "are not finite are at the top, errors below 10⁻⁴ at the bottom; bars are one standard error."
     )
-    return figure, "Error of the gradient against the time of one", caption
+    return {"error_against_time": (figure, "Error of the gradient against the time of one", caption)}

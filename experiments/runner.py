@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.config import ExperimentError, Run, load_runs, part
-from experiments.output import building, keeping, recover, write_csv, write_text, write_toml, writing
-from experiments.parallel import num_cores
+from experiments.output import building, keeping, recover, write_csv, write_toml, write_whole, writing
 from experiments.words import joined, merged
-from experiments.workspace import CompileClock, Workspace
+from experiments.workspace import CompileClock, Workspace, num_cores
 
 if TYPE_CHECKING:
     from experiments.report import Report
@@ -50,8 +49,8 @@ def run_file(file: str, overrides: list[str], *, output: Path, force: bool) -> P
 
         with writing(top):
             summary = _of_sweep(runs[0], folders)
-            write_text(top / "report.html", overview(runs, folders, summary["answer"]))
-            write_text(top / "summary.json", json.dumps(summary, indent=2) + "\n")
+            write_whole(top / "report.html", overview(runs, folders, summary["answer"]))
+            write_whole(top / "summary.json", json.dumps(summary, indent=2) + "\n")
         print(f"sweep of {len(runs)}: {top / 'report.html'}")
     return top / "report.html"
 
@@ -105,7 +104,7 @@ def write_gallery(output: Path) -> Path:
     if not shown:
         raise ExperimentError(f"there are no results in {output}: make demo leaves one; --output names another folder")
     with writing(output):
-        write_text(output / "index.html", gallery(shown))
+        write_whole(output / "index.html", gallery(shown))
     for name in sorted(set(found) - set(shown)):
         print(f"left out: {output / name}, made by an earlier version; run it again", file=sys.stderr)
     print(output / "index.html")
@@ -164,7 +163,7 @@ def _write(run: Run, report: "Report", folder: Path, facts: dict[str, Any]) -> N
         "figure": report.figures[0].file if report.figures else None,
         "video": report.video,
     }
-    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    write_whole(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     told = {"question": run.question, "expected": run.expected, "about": _about(facts)}
     text = page(report, folder, name=name, config=(folder / "config.toml").read_text(encoding="utf-8"), **told)
     (folder / "report.html").write_text(text, encoding="utf-8")

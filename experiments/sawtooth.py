@@ -39,17 +39,15 @@ OtherName = Literal["ball_inclined", "ball_inclined_rolling", "two_balls", "two_
 class Settings(OwnScene, RunSettings):
     """Outcomes of motions with impacts, and their derivatives, over where within a time step the impact falls."""
 
+    # Which motions, each with its own contact, limits and integrator; a scene of one's own takes their place.
     cases: Annotated[tuple[Literal[RobotName, BallName, OtherName], ...], Field(min_length=1)]
-    """Which motions, each with its own contact, limits and integrator; a scene of one's own takes their place."""
+    # How far to both sides the one number goes that moves an own scene: a constant control in halves of its range, or
+    # without actuators a velocity at the start (m/s, rad/s).
     width: Positive = 0.05
-    """How far to both sides the one number goes that moves an own scene: a constant control in halves of its range, or without
-    actuators a velocity at the start (m/s, rad/s)."""
-    timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.002,)
-    """In s, besides the motion's own."""
-    num_phases: Annotated[int, Field(ge=64)] = 192
-    """Starts over the interval."""
+    timesteps: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.002,)  # in s, besides the motion's own
+    num_phases: Annotated[int, Field(ge=64)] = 192  # starts over the interval
+    # By what the time step is divided for MuJoCo's converged motion; 0 leaves that comparison out.
     reference: Annotated[int, Field(ge=0, le=64)] = 0
-    """By what the time step is divided for MuJoCo's converged motion; 0 leaves that comparison out."""
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,13 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Confidence = Annotated[float, Field(gt=0.5, lt=1.0)]
 Several = Annotated[int, Field(ge=2)]
+Precision = Literal["float32", "float64"]
 
 
 class SettingsTable(BaseModel):
     """A table of settings that refuses unknown keys and wrong types."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     @field_validator("*")
     @classmethod
@@ -36,39 +37,36 @@ class SettingsTable(BaseModel):
 class RunSettings(SettingsTable):
     """What every kind of experiment has."""
 
-    experiment: str
-    """The kind of experiment, a folder or a file of `experiments`."""
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Of every random number in the run."""
-    precision: Literal["float32", "float64"] = "float64"
-    """Of every array in the run."""
+    experiment: str  # the kind of experiment, a folder or a file of `experiments`
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of every random number in the run
+    precision: Precision = "float64"  # of every array in the run
+
+
+class SizedSettings(RunSettings):
+    """What a kind has that takes its `sizes` from the file's table `[sizes.*]` that the size names."""
+
+    size: Literal["quick", "default", "full"] = "default"  # how much is spent
 
 
 class VideoSettings(SettingsTable):
     """How a video is drawn."""
 
-    speed: Positive = 0.25
-    """Simulated over shown time: 1 is real speed."""
-    fps: Positive = 30.0
-    """Frames per second."""
-    width: Annotated[int, Field(ge=64, le=1920)] = 480
-    """Of one motion, in pixels."""
-    height: Annotated[int, Field(ge=64, le=1080)] = 270
-    """Of one motion, in pixels."""
+    speed: Positive = 0.25  # simulated over shown time: 1 is real speed
+    fps: Positive = 30.0  # frames per second
+    width: Annotated[int, Field(ge=64, le=1920)] = 480  # of one motion, in pixels
+    height: Annotated[int, Field(ge=64, le=1080)] = 270  # of one motion, in pixels
 
 
 class OwnScene(SettingsTable):
     """A scene of one's own, in place of those that a kind of experiment has."""
 
-    scene: str | None = None
-    """An MJCF file; without it, the experiment's own."""
+    scene: str | None = None  # an MJCF file; without it, the experiment's own
+    # Of a trajectory: file.py:function, module:function, or at the end height:body, speed:body, upright:body,
+    # reach:body/site; without it, a random mix of where the heaviest body ends up.
     cost: str | None = None
-    """Of a trajectory: file.py:function, module:function, or at the end height:body, speed:body, upright:body,
-    reach:body/site; without it, a random mix of where the heaviest body ends up."""
-    start: str | None = None
-    """A key frame of the scene by name; without it, the reference pose."""
+    start: str | None = None  # a key frame of the scene by name; without it, the reference pose
+    # Time steps of a rollout; without it, those of half a second, 50 to 300.
     horizon: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """Time steps of a rollout; without it, those of half a second, 50 to 300."""
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:

@@ -24,35 +24,27 @@ from experiments.problems.textbook import Textbook
 from experiments.report import Bold, Table, tabulated
 from experiments.settings import Confidence, Finite, Positive, RunSettings, Several
 from experiments.theme import FIRST, MUTED, REFERENCE, Drawings, power, subplots
-from experiments.words import capitalised, named, quantity
+from experiments.words import capitalised, counted, named, quantity
 from experiments.workspace import Workspace
 
 
 class Settings(RunSettings):
     """Error, bias and variance of estimators against samples and stiffness, with closed forms drawn in."""
 
+    # The cost, a function of `experiments/problems/textbook.py`.
     problem: Literal["heaviside", "soft_heaviside", "quadratic_sine"]
-    """The cost, a function of `experiments/problems/textbook.py`."""
-    point: Finite
-    """Where the gradient is estimated."""
-    stddev: Positive
-    """Of the noise."""
+    point: Finite  # where the gradient is estimated
+    stddev: Positive  # of the noise
+    # In the order of the legend.
     estimators: Annotated[tuple[MethodSettings, ...], Field(min_length=1, max_length=10)]
-    """In the order of the legend."""
+    # Rollouts per estimate, all that an estimator spends included, for error against rollouts.
     num_samples: Annotated[tuple[Several, ...], Field(min_length=2)]
-    """Rollouts per estimate, all that an estimator spends included, for error against rollouts."""
-    num_repeats: Several = 400
-    """Estimates of each estimator at each setting."""
-    stiffness: tuple[Positive, ...] = ()
-    """To sweep: 1/width of the soft step, or the frequency of the sine."""
-    shown_stiffness: Positive | None = None
-    """At which error against rollouts is measured."""
-    samples_at_stiffness: Several = 100
-    """Rollouts per estimate in the sweep of stiffness."""
-    amplitude: Positive = 0.1
-    """Of the sine."""
-    confidence: Confidence = 0.95
-    """Of every interval."""
+    num_repeats: Several = 400  # estimates of each estimator at each setting
+    stiffness: tuple[Positive, ...] = ()  # to sweep: 1/width of the soft step, or the frequency of the sine
+    shown_stiffness: Positive | None = None  # at which error against rollouts is measured
+    samples_at_stiffness: Several = 100  # rollouts per estimate in the sweep of stiffness
+    amplitude: Positive = 0.1  # of the sine
+    confidence: Confidence = 0.95  # of every interval
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":
@@ -238,8 +230,7 @@ def _best(table: xr.Dataset) -> str:
     """Name the estimator of least error, and count those whose intervals overlap its own."""
     table = table.sortby("rmse")
     ties = table.estimator.values[table.rmse_low.values <= table.rmse_high.values[0]]
-    others = "one other" if len(ties) == 2 else f"{len(ties) - 1} others"
-    return f"{ties[0]}, in a tie with {others}" if len(ties) > 1 else str(ties[0])
+    return f"{ties[0]}, in a tie with {counted(len(ties) - 1, 'other', 'others')}" if len(ties) > 1 else str(ties[0])
 
 
 def _bias(outcome: Outcome) -> str:
@@ -379,10 +370,6 @@ def _marks(axis: Axes, x: np.ndarray, table: xr.Dataset, name: str, scale: float
         if has_exact:
             axis.plot(at, one.exact_rmse, color=look["color"], lw=1.0)
     axis.set_xscale("log")
-    _ticks(axis, x)
-
-
-def _ticks(axis: Axes, values: np.ndarray, most: int = 8) -> None:
-    shown = values[:: -(-len(values) // most)]
+    shown = x[:: -(-len(x) // 8)]
     axis.set_xticks(shown, [power(value) for value in shown])
     axis.minorticks_off()

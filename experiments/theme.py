@@ -103,10 +103,11 @@ def logarithmic(*axes: Axis) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def legend_below(figure: Picture, axis: Axes, columns: int) -> None:
-    """Name under the panels what one of them shows."""
-    handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), fontsize=8.5)
+def legend_below(figure: Picture, axes: Axes | Iterable[Axes], columns: int) -> None:
+    """Name under the panels what one or several of them show."""
+    shown = [axes] if isinstance(axes, Axes) else axes
+    handles = [handle for axis in shown for handle in axis.get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(columns, len(handles)), fontsize=8.5)
 
 
 def plain(axis: Axis) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import itertools
 import subprocess
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -32,35 +33,26 @@ _HORIZON = 20  # steps of trajectory optimisation alone
 class Sizes(SettingsTable):
     """How much is searched."""
 
-    num_seeds: Annotated[int, Field(ge=1)] = 6
-    """Searches by each arm."""
-    capacity: Annotated[int, Field(ge=32)] = 2000
-    """Most nodes of a tree."""
-    max_seconds: Positive = 30.0
-    """Most time of a search, without compilation (s)."""
+    num_seeds: Annotated[int, Field(ge=1)] = 6  # searches by each arm
+    capacity: Annotated[int, Field(ge=32)] = 2000  # most nodes of a tree
+    max_seconds: Positive = 30.0  # most time of a search, without compilation (s)
 
 
 class Settings(RunSettings):
     """A body is turned about an axis by a hand, over several seeds."""
 
+    # Two fingers and a disc in a plane, or the Shadow hand with a block of gymnasium-robotics, which is downloaded.
     hand: Literal["planar", "shadow"]
-    """Two fingers and a disc in a plane, or the Shadow hand with a block of gymnasium-robotics, which is downloaded."""
-    angle: Positive
-    """Turn of the goal (degrees)."""
-    angle_tolerance: Positive = 6.0
-    """Distance from it that counts as reached (degrees)."""
-    position_tolerance: Positive = 0.03
-    """The same for the place of the body (m)."""
+    angle: Positive  # turn of the goal (degrees)
+    angle_tolerance: Positive = 6.0  # distance from it that counts as reached (degrees)
+    position_tolerance: Positive = 0.03  # the same for the place of the body (m)
+    # Samples of a tree at a time; where steps are slow, fewer make it deeper in the same time.
     batch: Annotated[int, Field(ge=1)] = 16
-    """Samples of a tree at a time; where steps are slow, fewer make it deeper in the same time."""
+    # Iterations of trajectory optimisation after a tree; alone twice as many.
     num_iterations: Annotated[int, Field(ge=1)] = 10
-    """Iterations of trajectory optimisation after a tree; alone twice as many."""
-    size: Literal["default", "quick"] = "default"
-    """Which of the sizes."""
-    sizes: Sizes = Sizes()
-    """One of the tables, by the size."""
-    video: VideoSettings | None = VideoSettings(speed=0.5, width=480, height=360)
-    """Of a path of the smoothed tree."""
+    size: Literal["default", "quick"] = "default"  # which of the sizes
+    sizes: Sizes = Sizes()  # one of the tables, by the size
+    video: VideoSettings | None = VideoSettings(speed=0.5, width=480, height=360)  # of a path of the smoothed tree
 
 
 @dataclass(frozen=True)
@@ -169,15 +161,12 @@ def _block() -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
 
 def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Search by every arm from every seed."""
-    problem, attempts, count = Problem(settings), [], settings.sizes.num_seeds
+    problem, parts = Problem(settings), {}
     trees = {arm: problem.tree(arm, settings.batch) for arm in (SMOOTHED, UNSMOOTHED)}
-    with workspace.stage("search", "attempts", len(ARMS) * count) as advance_to:
-        for number in range(len(ARMS) * count):
-            arm, seed = ARMS[number % len(ARMS)], settings.seed + number // len(ARMS)
-            compute = functools.partial(_attempt, problem, settings, trees.get(arm), arm, seed)
-            attempts.append(workspace.once(f"{arm} {seed}", compute))
-            advance_to(number + 1)
-    return Outcome(settings, attempts)
+    for number, arm in itertools.product(range(settings.sizes.num_seeds), ARMS):
+        given = problem, settings, trees.get(arm), arm, settings.seed + number
+        parts[f"{arm} {settings.seed + number}"] = functools.partial(_attempt, *given)
+    return Outcome(settings, workspace.each("search", "attempts", parts))
 
 
 def _attempt(problem: Problem, settings: Settings, tree: Tree | None, arm: str, seed: int) -> Attempt:

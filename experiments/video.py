@@ -62,11 +62,6 @@ def with_coarse_shadows(mj_model: mujoco.MjModel) -> mujoco.MjModel:
 
 def tile(videos: Sequence[np.ndarray], captions: Sequence[str], *, columns: int) -> np.ndarray:
     """Put videos of one size side by side, each under its caption; one that ends early keeps its last frame."""
-    if not videos or len(videos) != len(captions):
-        raise ValueError(f"captions must be as many as videos, and at least 1, got {len(captions)} for {len(videos)}")
-    sizes = {video.shape[1:] for video in videos}
-    if len(sizes) > 1:
-        raise ValueError(f"videos must have one size, got {sorted(size[:2] for size in sizes)}")
     length = max(len(video) for video in videos)
     padded = [video[np.minimum(np.arange(length), len(video) - 1)] for video in videos]
     cells = [_captioned(video, caption) for video, caption in zip(padded, captions, strict=True)]

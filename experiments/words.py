@@ -46,6 +46,11 @@ def named(labels: Collection[str], among: int, *, words: int) -> str:
     return f"all {among}" if len(labels) == among else f"{len(labels)} of {among}"
 
 
+def counted(number: int, one: str, several: str) -> str:
+    """Count things, such as "one seed" and "3 seeds"."""
+    return f"one {one}" if number == 1 else f"{number} {several}"
+
+
 def merged(sentences: Iterable[str]) -> list[str]:
     """Say once what is said of several: "a: it is so" and "b: it is so" become "a and b: it is so"."""
     subjects: dict[str, list[str]] = {}

@@ -1,6 +1,7 @@
-"""What a running experiment sees of its output folder, its clock and its terminal."""
+"""What a running experiment sees of its output folder, its clock, its terminal and its machine."""
 
 import contextlib
+import os
 import pickle
 import re
 import sys
@@ -8,18 +9,20 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from tqdm import tqdm
 
-from experiments.output import writing
+from experiments.output import write_whole, writing
 
 if TYPE_CHECKING:
     from mjxgrad.scene import Scene
 
-_Found = TypeVar("_Found")
+_Item, _Found = TypeVar("_Item"), TypeVar("_Found")
+_MOST = 8  # programs that are compiled side by side, at most: the largest take a gigabyte each
 
 
 class Workspace:
@@ -55,9 +58,7 @@ class Workspace:
         found = compute()
         content = pickle.dumps((found, time.perf_counter() - started, self.told[before:]))
         with writing(self.folder):
-            partial = path.with_suffix(".partial")
-            partial.write_bytes(content)
-            partial.replace(path)
+            write_whole(path, content)
         return found
 
     def each(self, stage: str, unit: str, parts: Mapping[str, Callable[[], _Found]]) -> list[_Found]:
@@ -133,3 +134,29 @@ class CompileClock:
     def _listen(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event.endswith("backend_compile_duration"):
             self.seconds += duration_secs
+
+
+def num_cores() -> int:
+    """Count the cores that this process may use."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+
+
+def num_compilers() -> int:
+    """Say how many programs to compile side by side: one per core, as many as memory has room for."""
+    return min(num_cores(), _MOST)
+
+
+def in_threads(
+    function: Callable[[_Item], _Found], items: Iterable[_Item], advance_to: Callable[[int], None] = lambda _: None
+) -> list[_Found]:
+    """Call a function on every item, in threads: XLA compiles each mostly on one core and without Python.
+
+    Results keep the order, and `advance_to` is told how many there are.
+    """
+    done = []
+    with ThreadPoolExecutor(num_compilers()) as pool:
+        for result in pool.map(function, items):
+            done.append(result)
+            advance_to(len(done))
+    return done

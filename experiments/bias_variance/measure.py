@@ -187,9 +187,8 @@ def _table(measured: BiasVariance, stiffness: Float[np.ndarray, " rows"], settin
     )
     # Root of bias² + variance / rollouts.
     budget = settings.rollouts_per_gradient
-    table["first_order_error"] = np.hypot(
-        table.bias.where(table.is_biased, 0.0), np.sqrt(table.first_order_variance / budget)
-    )
+    bias = table.bias.where(table.is_biased, 0.0)
+    table["first_order_error"] = np.hypot(bias, np.sqrt(table.first_order_variance / budget))
     table["zeroth_order_error"] = np.sqrt(table.zeroth_order_variance / budget)
     table["first_wins"] = _MARGIN * table.first_order_error < table.zeroth_order_error
     table["zeroth_wins"] = _MARGIN * table.zeroth_order_error < table.first_order_error

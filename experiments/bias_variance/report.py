@@ -141,13 +141,10 @@ def _choice(swept: xr.Dataset, words: Words) -> str:
     for end in np.unique(until)[::-1]:
         limit = f"up to {words.lead}{power(swept.stiffness.values[end - 1])}{words.per}"
         where = "nowhere" if end == 0 else "everywhere" if end == last else limit
-        parts.append(f"{where} {_angles(swept.angle[until == end], words)}")
+        angles = joined(f"{angle:g}" for angle in swept.angle.values[until == end])
+        parts.append(f"{where} at {angles}{words.at}")
     count = f"{int((zeroth & beyond).sum())} of {int(beyond.sum())}"
     return f"first order is as close or closer {joined(parts)}, and beyond that zeroth order is closer in {count} cases"
-
-
-def _angles(angles: xr.DataArray, words: Words) -> str:
-    return f"at {joined(f'{angle:g}' for angle in angles.values)}{words.at}"
 
 
 def _default(outcome: Outcome) -> list[str]:

@@ -11,38 +11,30 @@ from experiments.settings import Confidence, Finite, OwnScene, Positive, RunSett
 class ThrowsSettings(VideoSettings):
     """Rollouts side by side: each of some angles at each of some stiffnesses."""
 
-    angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=4)]
-    """One column each, in rad."""
-    stiffness: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=3)]
-    """One row each, in 1/s²."""
+    angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=4)]  # one column each, in rad
+    stiffness: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=3)]  # one row each, in 1/s²
 
 
 class Settings(OwnScene, RunSettings):
     """Bias and variance of both estimates against contact stiffness, at several points."""
 
-    task: Literal["ball_wall", "ramp"] | None = None
-    """What is differentiated; a scene of one's own takes its place."""
+    task: Literal["ball_wall", "ramp"] | None = None  # what is differentiated; a scene of one's own takes its place
+    # Of the noise on the angle, in rad (on the ramp without a unit; of an own scene on each control at each step, in
+    # halves of its range, or without actuators on velocities at the start).
     stddev: Annotated[float, Field(ge=1e-9, allow_inf_nan=False)]
-    """Of the noise on the angle, in rad (on the ramp without a unit; of an own scene on each control at each step, in halves of
-    its range, or without actuators on velocities at the start)."""
+    # Where gradients are estimated, in rad (of an own scene a constant control, or a velocity, along one direction).
     angles: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=6)]
-    """Where gradients are estimated, in rad (of an own scene a constant control, or a velocity, along one direction)."""
+    # Contact stiffness to sweep, in 1/s² (for the ramp its slope, without a unit).
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=2)]
-    """Contact stiffness to sweep, in 1/s² (for the ramp its slope, without a unit)."""
-    damping_ratio: Positive = 1.0
-    """Of the contacts, the same at every stiffness; 1 is critical."""
-    include_default: bool = True
-    """Whether the scene's own softness joins the sweep, and is marked."""
-    num_samples: Several
-    """Rollouts per estimate."""
+    damping_ratio: Positive = 1.0  # of the contacts, the same at every stiffness; 1 is critical
+    include_default: bool = True  # whether the scene's own softness joins the sweep, and is marked
+    num_samples: Several  # rollouts per estimate
+    # Rollouts per stiffness for the landscape, from which the reference is taken.
     reference_samples: Annotated[int, Field(ge=100)]
-    """Rollouts per stiffness for the landscape, from which the reference is taken."""
+    # The budget for which the report says which estimate to use.
     rollouts_per_gradient: Annotated[int, Field(ge=1)] = 100
-    """The budget for which the report says which estimate to use."""
-    confidence: Confidence = 0.95
-    """Of every interval."""
-    video: ThrowsSettings | None = None
-    """Of the throws of `ball_wall`."""
+    confidence: Confidence = 0.95  # of every interval
+    video: ThrowsSettings | None = None  # of the throws of `ball_wall`
 
     @property
     def problem(self) -> str:

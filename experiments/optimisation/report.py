@@ -11,7 +11,7 @@ from scipy.stats import mannwhitneyu
 from experiments.optimisation.measure import Difference, Outcome, Run
 from experiments.report import MOST_WORDS, Bold, Table, tabulated
 from experiments.theme import REFERENCE, Drawings, logarithmic, looks, panel, power, subplots
-from experiments.words import capitalised, percent, quantity
+from experiments.words import capitalised, counted, percent, quantity
 
 # A column in the page over a sweep.
 _AGAINST = "α-order against the better"
@@ -26,13 +26,10 @@ def answer(outcome: Outcome) -> str:
         return f"{lowest}, at {quantity(best.mean, best.spread)}."
     second, highest = (choose(others, key=lambda run: run.mean) for choose in (min, max))
     is_proven = mannwhitneyu(best.kept, second.kept).pvalue <= 0.05
-    told = f"{lowest} ({quantity(best.mean)}{'' if is_proven else f'; {_seeds(best)} cannot prove it'})"
+    doubt = "" if is_proven else f"; {counted(best.kept.size, 'seed', 'seeds')} cannot prove it"
+    told = f"{lowest} ({quantity(best.mean)}{doubt})"
     whole = f"{told}, {highest.method.label} highest ({quantity(highest.mean)})."
     return whole if len(whole.split()) <= MOST_WORDS else f"{told}."
-
-
-def _seeds(run: Run) -> str:
-    return "one seed" if run.kept.size == 1 else f"{run.kept.size} seeds"
 
 
 def verdict(outcome: Outcome) -> str:

@@ -14,21 +14,19 @@ _NAMES = {"mppi": "MPPI", "reinforce": "REINFORCE", "cross_entropy": "cross-entr
 class MethodSettings(SettingsTable):
     """One method, with what is set of its options: an estimator for gradient descent, or a search."""
 
+    # Of a function in `mjxgrad.estimators` or in `searches.py`.
     name: Literal[
         "first_order", "zeroth_order", "least_squares", "control_variate", "alpha_order", "reinforce",
         "per_step_inverse_variance", "cross_entropy", "mppi", "predictive_sampling",
     ]  # fmt: skip
-    """Of a function in `mjxgrad.estimators` or in `searches.py`."""
+    # Of zeroth order and REINFORCE; their own default if it is not set.
     baseline: Literal["leave_one_out", "zero_noise", "none"] | None = None
-    """Of zeroth order and REINFORCE; their own default if it is not set."""
-    antithetic: bool | None = None
-    """Whether zeroth order uses noise in pairs."""
+    antithetic: bool | None = None  # whether zeroth order uses noise in pairs
+    # How alpha_order chooses its weight; bias_constrained takes the published constants of the task.
     rule: Literal["least_risk", "inverse_variance", "concavity", "trust_region", "bias_constrained"] | None = None
-    """How alpha_order chooses its weight; bias_constrained takes the published constants of the task."""
-    control_variate: bool | None = None
-    """Whether the unbiased part of alpha_order uses derivatives."""
+    control_variate: bool | None = None  # whether the unbiased part of alpha_order uses derivatives
+    # Width of a search, in the parameters' units; without it, the noise on the controls if they are the parameters.
     stddev: Positive | None = None
-    """Width of a search, in the parameters' units; without it, the noise on the controls if they are the parameters."""
 
     @model_validator(mode="after")
     def _check(self) -> "MethodSettings":
@@ -84,24 +82,17 @@ class MethodSettings(SettingsTable):
 class Settings(OwnScene, RunSettings):
     """A task, optimised by several methods from the same start at equal rollouts, over many seeds."""
 
+    # What is optimised; see `experiments.optimisation.published`. A scene of one's own, by its controls, takes its place.
     task: Literal["push_soft", "push_stiff", "friction", "tennis", "motion_planning", "lqr"] | None = None
-    """What is optimised; see `experiments.optimisation.published`. A scene of one's own, by its controls, takes its place."""
-    stddev: Positive = 0.1
-    """Of the noise on each control of an own scene, in halves of its range."""
-    methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]
-    """In the order of the table."""
-    seeds: Several = 10
-    """Runs of each method, in one program."""
-    num_steps: Annotated[int, Field(ge=1)] | None = None
-    """Of each run; without it, as many as published."""
+    stddev: Positive = 0.1  # of the noise on each control of an own scene, in halves of its range
+    methods: Annotated[tuple[MethodSettings, ...], Field(min_length=2, max_length=14)]  # in the order of the table
+    seeds: Several = 10  # runs of each method, in one program
+    num_steps: Annotated[int, Field(ge=1)] | None = None  # of each run; without it, as many as published
+    # Rollouts per step, all that a method spends included; without it, as many as published.
     num_samples: Several | None = None
-    """Rollouts per step, all that a method spends included; without it, as many as published."""
-    learning_rate: Positive | None = None
-    """Of plain gradient descent; without it, as published."""
-    evaluations: Annotated[int, Field(ge=1)] = 50
-    """How often the cost without noise is measured on the way."""
-    confidence: Confidence = 0.95
-    """Of every interval."""
+    learning_rate: Positive | None = None  # of plain gradient descent; without it, as published
+    evaluations: Annotated[int, Field(ge=1)] = 50  # how often the cost without noise is measured on the way
+    confidence: Confidence = 0.95  # of every interval
 
     @model_validator(mode="after")
     def _check(self) -> "Settings":

@@ -4,5 +4,4 @@ from pathlib import Path
 
 import gymnasium
 
-ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-"""Of gymnasium's robots."""
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"  # of gymnasium's robots

@@ -30,30 +30,13 @@ def compare(
     num_repeats: int = 200,
     confidence: float = 0.95,
 ) -> xr.Dataset:
-    """Measure root-mean-square error, bias and variance of estimators under an equal budget.
+    """Measure root-mean-square error, bias and variance of estimates whose number of rollouts is within a budget.
 
-    Each estimator gets the largest `num_samples` whose reported rollouts stay within the budget. Its repetitions are
-    independent and run in one compiled program. All estimators share the same keys, which reduces chance differences.
-
-    Args:
-        estimators: estimators by name; each is called like `mjxgrad.estimators.zeroth_order`. Bind settings by
-            `functools.partial`.
-        objective: the objective to differentiate, of one parameter.
-        params: the point.
-        key: consumed here.
-        budget: rollouts of one estimate, as the estimate itself counts them. At least 2.
-        reference: the true gradient.
-        num_repeats: number of estimates per estimator. At least 2.
-        confidence: coverage of the intervals.
-
-    Returns:
-        By `estimator`, of whole estimates, not samples; those that are not finite are left out: `num_samples` that were asked
-        for, `num_rollouts` that one estimate reports, `num_finite` estimates; their `mean`, its `bias` and the `rmse`, the
-        last two with `_low` and `_high` of their intervals; their `variance`, and the `claimed_variance`, the mean squared
-        standard error of the estimates: an honest estimator has it equal to `variance`.
-
-    Raises:
-        ValueError: if the budget buys no estimate of an estimator, or fewer than two of its estimates are finite.
+    All estimators share the same keys, which reduces chance differences. The result is by `estimator`, of whole estimates, not
+    samples; those that are not finite are left out. It has the `num_samples` that were asked for, the `num_rollouts` that one
+    estimate reports, `num_finite` estimates; their `mean`, its `bias` and the `rmse`, the last two with `_low` and `_high` of
+    their intervals; their `variance`, and the `claimed_variance`, the mean squared standard error of the estimates, which an
+    honest estimator has equal to `variance`.
     """
     timing_key, repeats_key = jax.random.split(key)
     rows = []
@@ -137,16 +120,6 @@ def root_mean_square_interval(
     The mean squared error is positive and skewed. Its interval is that of a gamma distribution with equal mean and variance
     (a chi-square with Satterthwaite's degrees of freedom). For one unbiased normal coordinate with known kurtosis it is exact.
     Where a bias dominates it becomes the usual normal interval.
-
-    Args:
-        squared_errors: squared distance of each repetition to the reference.
-        confidence: coverage of the interval.
-
-    Returns:
-        The root-mean-square error, and the ends of its interval.
-
-    Raises:
-        ValueError: if `confidence` is not between 0 and 1.
 
     References:
         Satterthwaite. An approximate distribution of estimates of variance components. Biometrics Bulletin 2, 1946.

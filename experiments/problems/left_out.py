@@ -41,29 +41,19 @@ _DIFFERENCES, _BEGIN = mujoco.mjd_inverseFD, inverse.Inverse.__init__
 
 @dataclass(frozen=True)
 class Part:
-    """Something that is left out.
+    """Something that is left out."""
 
-    Attributes:
-        what, why: in a few words.
-        engines: who leaves it out.
-        edit: puts it back into a file, and returns whether there is anything to put back.
-        load, rollout: arguments of `load_scene` and `rollout` that put it back.
-        patch: puts it back into the library.
-        step: the step of a loop that carries the whole data.
-        is_argument: whether the scene is an argument of a program, whose numbers the compiler does not know.
-        off: why results differ beyond rounding, if they do.
-    """
-
-    what: str
-    why: str
-    engines: tuple[EngineName, ...] = ("mjx", "mujoco")
+    what: str  # in a few words
+    why: str  # likewise
+    engines: tuple[EngineName, ...] = ("mjx", "mujoco")  # who leave it out
+    # Puts it back into a file, and returns whether there is anything to put back.
     edit: Callable[[mujoco.MjSpec], bool] = lambda _: True
-    load: dict[str, Any] = field(default_factory=dict)
-    rollout: dict[str, Any] = field(default_factory=dict)
-    patch: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext
-    step: Callable | None = None
-    is_argument: bool = False
-    off: str = ""
+    load: dict[str, Any] = field(default_factory=dict)  # arguments of `load_scene` that put it back
+    rollout: dict[str, Any] = field(default_factory=dict)  # those of `rollout`
+    patch: Callable[[], contextlib.AbstractContextManager] = contextlib.nullcontext  # puts it back into the library
+    step: Callable | None = None  # of a loop that carries the whole data
+    is_argument: bool = False  # whether the scene is an argument, whose numbers the compiler does not know
+    off: str = ""  # why results differ beyond rounding, if they do
 
 
 @contextlib.contextmanager

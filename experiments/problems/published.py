@@ -19,19 +19,12 @@ from mjxgrad.objective.task import Outcome, PolicyFunction, Task
 
 
 class QuadraticCost(eqx.Module):
-    """Squares of what is left to the goal, and of the controls.
+    """Squares of what is left to the goal, and of the controls."""
 
-    Attributes:
-        goal: g.
-        weight: diagonal of Q, charged before every step.
-        final_weight: diagonal of Q_d, charged after the last.
-        control_weight: R, of the squared norm of the controls.
-    """
-
-    goal: Float[Array, " states"]
-    weight: Float[Array, " states"]
-    final_weight: Float[Array, " states"]
-    control_weight: Float[Array, ""]
+    goal: Float[Array, " states"]  # g
+    weight: Float[Array, " states"]  # diagonal of Q, charged before every step
+    final_weight: Float[Array, " states"]  # diagonal of Q_d, charged after the last
+    control_weight: Float[Array, ""]  # R, of the squared norm of the controls
 
     def stage(self, state: Float[Array, " states"], control: Float[Array, " nu"]) -> Float[Array, ""]:
         """Return (x − g)ᵀQ(x − g) + R‖u‖²."""

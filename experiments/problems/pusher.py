@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from mjxgrad.envs import Environment
+from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
@@ -29,9 +29,7 @@ class Pusher(Environment):
         facing = jnp.stack([jnp.cos(turn), jnp.sin(turn)])
         return jnp.concatenate([10 * (rod - finger), 10 * (memory - rod), 10 * rod, facing, state.qvel])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: Float[Array, "2"]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Float[Array, "2"]) -> Rewards:
         finger, rod = after.qpos[:2], after.qpos[2:4]
         return {
             "distance": -10 * _length(memory - rod),

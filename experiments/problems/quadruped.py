@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from mjxgrad.bodies.spatial import rotation_matrix
-from mjxgrad.envs import Environment
+from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import Scene, load_scene
 from mjxgrad.tasks import scene_path
@@ -60,13 +60,10 @@ class Quadruped(Environment):
 
     def privileged(self, state: State, memory: Memory) -> Float[Array, " 7"]:
         """Return speed and height, which the rewards are about, the next push, and the friction."""
-        return jnp.concatenate(
-            [_in_trunk(state)[1], state.qpos[2:3], memory["push"], self.scene.model.geom_friction[:1, 0]]
-        )
+        friction = self.scene.model.geom_friction[:1, 0]
+        return jnp.concatenate([_in_trunk(state)[1], state.qpos[2:3], memory["push"], friction])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Memory) -> Rewards:
         down, speed, turning = _in_trunk(after)
         command = memory["command"]
         return {

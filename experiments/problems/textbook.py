@@ -129,12 +129,9 @@ class SoftHeaviside(Textbook):
 
     With $p$ the chance to fall on the slope, $F' = 2p/\nu$, and a first-order sample is $2/\nu$ with probability $p$,
     else 0: unbiased, with variance $(2/\nu)^2 p(1 - p)$, which grows as $1/\nu$.
-
-    Attributes:
-        width: $\nu > 0$ of the slope; $1/\nu$ is the stiffness.
     """
 
-    width: Float[Array, ""] = eqx.field(converter=_number)
+    width: Float[Array, ""] = eqx.field(converter=_number)  # $\nu > 0$ of the slope; $1/\nu$ is the stiffness
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
         return jnp.clip(2 * x[0] / self.width, -1, 1)
@@ -161,14 +158,10 @@ class QuadraticSine(Textbook):
 
     $F' = 2\theta + m\omega e^{-\omega^2\sigma^2/2}\cos\omega\theta$: the noise wipes the ripple out, while the
     variance of first order keeps $m^2\omega^2/2$.
-
-    Attributes:
-        amplitude: $m$.
-        frequency: $\omega$, in rad per unit of the parameter.
     """
 
-    amplitude: Float[Array, ""] = eqx.field(converter=_number)
-    frequency: Float[Array, ""] = eqx.field(converter=_number)
+    amplitude: Float[Array, ""] = eqx.field(converter=_number)  # $m$
+    frequency: Float[Array, ""] = eqx.field(converter=_number)  # $\omega$, in rad per unit of the parameter
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, ""]:
         return x[0] ** 2 + self.amplitude * jnp.sin(self.frequency * x[0])

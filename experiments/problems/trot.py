@@ -25,7 +25,7 @@ from mjxgrad import learning
 from mjxgrad.bodies.kinematics import kinematics
 from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.engines.state import data_of
-from mjxgrad.envs import Environment
+from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import load_scene
 from mjxgrad.tasks import scene_path
@@ -43,21 +43,13 @@ _JOINTS_WEIGHT = 2.5 * 3e-3
 
 
 class Trot(Environment):
-    """Twelve position servos, 50 actions a second; diagonal legs are lifted in turn, each pair for 0.26 s.
+    """Twelve position servos, 50 actions a second; diagonal legs are lifted in turn, each pair for 0.26 s."""
 
-    Attributes:
-        stance: where episodes start: at rest, on the feet.
-        base: where the base is to stay (m).
-        angles: that the joints are to have, action by action of one gait (rad).
-        speeds: likewise (rad/s).
-        heights: of the centres of the feet when all of that is so (m).
-    """
-
-    stance: Float[Array, " nq"]
-    base: Float[Array, "3"]
-    angles: Float[Array, "actions nu"]
-    speeds: Float[Array, "actions nu"]
-    heights: Float[Array, "actions feet"]
+    stance: Float[Array, " nq"]  # where episodes start: at rest, on the feet
+    base: Float[Array, "3"]  # where the base is to stay (m)
+    angles: Float[Array, "actions nu"]  # that the joints are to have, action by action of one gait (rad)
+    speeds: Float[Array, "actions nu"]  # likewise (rad/s)
+    heights: Float[Array, "actions feet"]  # of the centres of the feet when all of that is so (m)
 
     def start(self, key: PRNGKeyArray) -> State:
         return initial_state(self.scene, self.stance)
@@ -77,9 +69,7 @@ class Trot(Environment):
         wanted = self.angles[self._phase(jnp.maximum(memory["num_actions"] - 1, 0))]
         return jnp.concatenate([0.25 * state.qvel[5:6], down, posture, memory["targets"], wanted])
 
-    def rewards(
-        self, before: State, action: Float[Array, " nu"], after: State, memory: Memory
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Memory) -> Rewards:
         phase = self._phase(memory["num_actions"])
         place = jnp.concatenate([before.qpos[:3] - self.base, before.qpos[7:] - self.angles[phase]])
         speed = jnp.concatenate([before.qvel[:6], before.qvel[6:] - self.speeds[phase]])
@@ -151,22 +141,11 @@ def apg(**changes: Any) -> learning.Settings:
     falls linearly from 0.07 to 0.01. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
     which allows larger rates.
 
-    Args:
-        changes: settings that replace these.
-
     References:
         Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281
         (`brax/training/agents/apg`).
     """
-    settings = {
-        "discount": 1.0,
-        "trace": 1.0,
-        "alpha": 1.0,
-        "stddev": (0.07, 0.01),
-        "actor_layers": (256, 128),
-        "actor_scale": 0.01,
-        "actor_rate": 1e-4,
-        "actor_decay": 0.997,
-        "has_critic": False,
-    }
-    return learning.Settings(**(settings | changes))
+    rates = {"stddev": (0.07, 0.01), "actor_rate": 1e-4, "actor_decay": 0.997}
+    network = {"actor_layers": (256, 128), "actor_scale": 0.01}
+    plain = {"discount": 1.0, "trace": 1.0, "alpha": 1.0, "has_critic": False}
+    return learning.Settings(**rates | network | plain | changes)

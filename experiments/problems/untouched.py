@@ -34,29 +34,17 @@ from mjxgrad.tasks import scene_path
 
 
 class Untouched(InScene):
-    """A body under two forces, `qpos[:2]`, and others that it is to move, `qpos[2:]`.
+    """A body under two forces, `qpos[:2]`, and others that it is to move, `qpos[2:]`."""
 
-    Attributes:
-        target: where the others should be in the end, less where they begin (m).
-        unit: by what the squared error is divided (m²).
-        effort: price of the mean squared control.
-        proximity: price of the mean squared distance to the others, over that at the start.
-        softness: the scene's own contact, with its margin.
-        centre: of the driven body at the start, less those of the others (m).
-        reach: radii of the driven body and of another together (m).
-        num_pieces: controls are constant over as many pieces of the time.
-        horizon: number of steps, a multiple of `num_pieces`.
-    """
-
-    target: Float[Array, " others"]
-    unit: Float[Array, ""]
-    effort: Float[Array, ""]
-    proximity: Float[Array, ""]
-    softness: mg.Softness
-    centre: Float[Array, "bodies 2"]
-    reach: Float[Array, ""]
-    num_pieces: int = eqx.field(static=True)
-    horizon: int = eqx.field(static=True)
+    target: Float[Array, " others"]  # where the others should be in the end, less where they begin (m)
+    unit: Float[Array, ""]  # by what the squared error is divided (m²)
+    effort: Float[Array, ""]  # price of the mean squared control
+    proximity: Float[Array, ""]  # price of the mean squared distance to the others, over that at the start
+    softness: mg.Softness  # the scene's own contact, with its margin
+    centre: Float[Array, "bodies 2"]  # of the driven body at the start, less those of the others (m)
+    reach: Float[Array, ""]  # radii of the driven body and of another together (m)
+    num_pieces: int = eqx.field(static=True)  # controls are constant over as many pieces of the time
+    horizon: int = eqx.field(static=True)  # number of steps, a multiple of `num_pieces`
 
     def start(self, control: float) -> Float[Array, " dim"]:
         """Return constant controls."""

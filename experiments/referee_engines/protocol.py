@@ -29,9 +29,8 @@ def serve(make: Callable[[Scene, str], Pair]) -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     request = json.load(sys.stdin)
-    print(
-        json.dumps({name: importlib.metadata.version(name) for name in request["packages"]}), file=answers, flush=True
-    )
+    versions = {name: importlib.metadata.version(name) for name in request["packages"]}
+    print(json.dumps(versions), file=answers, flush=True)
     for name, scene in request["scenes"].items():
         for variant in request["variants"]:
             try:

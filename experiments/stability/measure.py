@@ -15,41 +15,25 @@ import xarray as xr
 from jaxtyping import Array, Bool, Float, Int
 
 import mjxgrad as mg
-from experiments.parallel import in_threads
-from experiments.stability.scenes import (
-    FIELDS,
-    GRAVITY,
-    Points,
-    StabilityScene,
-    catalogue,
-    configure,
-    effective,
-    points,
-)
+from experiments.stability.scenes import FIELDS, GRAVITY, Points, StabilityScene, catalogue, points
 from experiments.stability.settings import Settings
-from experiments.workspace import Workspace
+from experiments.workspace import Workspace, in_threads
 from mjxgrad._mjx import mjx
 from mjxgrad._warnings import collected
 
 C_MUJOCO = "C MuJoCo"
-NOT_ASKED = -1
-"""In the place of a value of `Derivative` that was not asked for."""
-_VELOCITY_LIMIT = 1e4
-"""Beyond it a rollout counts as diverged, as it does for `mg.rollout`."""
-_WIDTHS = (1e-4, 2e-5)
-"""Of finite differences by the start, in units of what a body flies in one step."""
+NOT_ASKED = -1  # in the place of a value of `Derivative` that was not asked for
+_VELOCITY_LIMIT = 1e4  # beyond it a rollout counts as diverged, as it does for `mg.rollout`
+_WIDTHS = (1e-4, 2e-5)  # of finite differences by the start, in units of what a body flies in one step
 _PARAMETER_WIDTHS = (1e-6, 2e-7)
 _RELATIVE = ("geom_solref", "jnt_solref", "geom_friction", "timestep")
 """Fields of the model that are changed in proportion, to judge the derivative by them."""
 _TOLERANCE = {"float64": 1e-3, "float32": 5e-2}
 
 # The thresholds are coarse on purpose: a class is a kind of behaviour, not an accuracy.
-UNSOLVED = 1e-3
-"""Share of a step's velocity by which a solve may be off."""
-GAIN = 0.05
-"""Share by which kinetic energy may exceed what there was to draw on."""
-AT_REST = 1e-3
-"""Share of that energy below which a body has settled."""
+UNSOLVED = 1e-3  # share of a step's velocity by which a solve may be off
+GAIN = 0.05  # share by which kinetic energy may exceed what there was to draw on
+AT_REST = 1e-3  # share of that energy below which a body has settled
 
 
 class _Kind(enum.IntEnum):
@@ -152,11 +136,8 @@ def classify_motion(
 ) -> Int[np.ndarray, " points"]:
     """Return what each rollout did, by values of `Motion`; of several failures the worst.
 
-    Args:
-        course: the rollouts.
-        gain: the largest kinetic energy over what there was to draw on: start, gravity and compressed springs.
-        rest: the final kinetic energy over the same.
-        has_crossed: whether bodies ended on the wrong side of each other.
+    Largest and final kinetic energy are over what there was to draw on: start, gravity and compressed springs. Bodies that
+    ended on the wrong side of each other have crossed.
     """
     # A comparison with NaN is false, so each question is asked in the form that NaN fails.
     answers = (
@@ -211,7 +192,7 @@ class _Case:
         model = self.scene.model()
         data, rows = mujoco.MjData(model), []
         for i in range(len(self.grid)):
-            configure(self.scene, model, data, self.grid[i])
+            self.scene.configure(model, data, self.grid[i])
             fields = {name: np.array(getattr(model, name)) for name in FIELDS}
             rows.append((fields | {"timestep": np.array(model.opt.timestep)}, *self.scene.start(self.grid[i])))
         return jax.tree.map(lambda *x: np.stack(x), *rows)
@@ -271,7 +252,7 @@ def _stored(scene: StabilityScene, point: dict[str, float]) -> float:
     """Return a bound on the energy of springs compressed at the start, all bodies taken together (J)."""
     if point["depth"] <= 0:
         return 0.0
-    stiffness, _ = effective(scene, point)
+    stiffness, _ = scene.effective(point)
     mass = sum(scene.masses(point["mass_ratio"]))
     depth = scene.depth_unit * point["depth"] * len(scene.masses(1.0))
     return 0.5 * mass * stiffness / max(point["impedance_last"], 1e-4) * depth**2 + mass * GRAVITY * depth
@@ -317,7 +298,7 @@ def in_c_mujoco(scene: StabilityScene, grid: Points, num_steps: int) -> Course:
     model = scene.model()
     data, rows = mujoco.MjData(model), []
     for i in range(len(grid)):
-        configure(scene, model, data, grid[i])
+        scene.configure(model, data, grid[i])
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = scene.start(grid[i])
         rows.append(_follow(model, data, num_steps))

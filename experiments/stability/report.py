@@ -23,15 +23,14 @@ from experiments.stability.measure import (
     SceneOutcome,
     against_c,
 )
-from experiments.stability.scenes import PARAMETERS, Points, StabilityScene, effective
-from experiments.theme import REFERENCE, Drawings, power, subplots
+from experiments.stability.scenes import PARAMETERS, Points, StabilityScene
+from experiments.theme import REFERENCE, Drawings, legend_below, power, subplots
 from experiments.words import percent
 from mjxgrad.contact.warnings import largest_stable_step, steepest
 
 _SAME_MOTION = 1e-3
 """Difference of final positions, over what a body flies in the rollout, up to which two motions are one."""
-_LITTLE_FRICTION = 0.03
-"""Below it the edges of a pyramid weigh more than a thousand times what its normal would."""
+_LITTLE_FRICTION = 0.03  # below it the edges of a pyramid weigh more than a thousand times what its normal would
 
 
 def answer(outcome: Outcome) -> str:
@@ -125,7 +124,7 @@ def load(scene: StabilityScene, points: Points) -> Float[np.ndarray, " points"]:
 
     def one(point: dict[str, float]) -> float:
         impedance = np.clip((point["impedance_first"], point["impedance_last"]), mujoco.mjMINIMP, mujoco.mjMAXIMP)
-        stiffness, damping = steepest(*effective(scene, point), impedance, point["width"])
+        stiffness, damping = steepest(*scene.effective(point), impedance, point["width"])
         frequency = np.sqrt(stiffness)
         limit = largest_stable_step(damping / (2 * frequency), mujoco.mjtIntegrator.mjINT_EULER)
         return point["timestep"] * frequency / limit
@@ -207,8 +206,7 @@ def _all_scenes(outcome: Outcome) -> tuple[Picture, str, str]:
         axis.grid(visible=False)
     axes[0, 0].set_yticks(range(count), [one.scene.name for one in outcome.scenes])
     axes[0, 0].invert_yaxis()
-    handles = [handle for axis in axes[0] for handle in axis.get_legend_handles_labels()[0]]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8.5)
+    legend_below(figure, axes[0], 5)
     bars = ", ".join((C_MUJOCO, *(f"mjxgrad in {name}" for name in precisions)))
     caption = (
         f"Points of stiff and extreme cases, {outcome.settings.num_steps} steps each. Bars of a scene, from above: {bars}; on "

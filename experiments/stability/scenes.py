@@ -53,35 +53,33 @@ class StabilityScene:
         """Compile it."""
         return mujoco.MjModel.from_xml_string(self.mjcf)
 
+    def configure(self, model: mujoco.MjModel, data: mujoco.MjData, point: Point) -> None:
+        """Set the model to a point of the grid, in place, with all that MuJoCo derives from masses."""
+        model.opt.timestep = point["timestep"]
+        solref = (point["time_constant"], point["damping_ratio"])
+        if point["stiffness"] > 0:
+            solref = tuple(-x for x in self.effective(point))
+        solimp = (point["impedance_first"], point["impedance_last"], point["width"])
+        kinds = ((model.jnt_solref, model.jnt_solimp),) if self.has_limits else ()
+        for references, impedances in (*kinds, (model.geom_solref, model.geom_solimp)):
+            references[:] = solref
+            impedances[:, :3] = solimp
+        model.geom_friction[:] = point["friction"] * np.array([1.0, 0.1 * RADIUS, 0.01 * RADIUS])
+        # Margins of two geoms add.
+        model.geom_margin[:], model.body_margin[:] = point["margin"] / 2, point["margin"] / 2
+        masses = np.array(self.masses(point["mass_ratio"]))
+        model.body_inertia[1:] *= (masses / model.body_mass[1:])[:, None]
+        model.body_mass[1:] = masses
+        mujoco.mj_setConst(model, data)
 
-def configure(scene: StabilityScene, model: mujoco.MjModel, data: mujoco.MjData, point: Point) -> None:
-    """Set a scene's model to a point of the grid, in place, with all that MuJoCo derives from masses."""
-    model.opt.timestep = point["timestep"]
-    solref = (point["time_constant"], point["damping_ratio"])
-    if point["stiffness"] > 0:
-        solref = tuple(-x for x in effective(scene, point))
-    solimp = (point["impedance_first"], point["impedance_last"], point["width"])
-    kinds = ((model.jnt_solref, model.jnt_solimp),) if scene.has_limits else ()
-    for references, impedances in (*kinds, (model.geom_solref, model.geom_solimp)):
-        references[:] = solref
-        impedances[:, :3] = solimp
-    model.geom_friction[:] = point["friction"] * np.array([1.0, 0.1 * RADIUS, 0.01 * RADIUS])
-    # Margins of two geoms add.
-    model.geom_margin[:], model.body_margin[:] = point["margin"] / 2, point["margin"] / 2
-    masses = np.array(scene.masses(point["mass_ratio"]))
-    model.body_inertia[1:] *= (masses / model.body_mass[1:])[:, None]
-    model.body_mass[1:] = masses
-    mujoco.mj_setConst(model, data)
-
-
-def effective(scene: StabilityScene, point: Point) -> tuple[float, float]:
-    """Give stiffness (1/s²) and damping (1/s) in effect."""
-    if point["stiffness"] > 0:
-        return point["stiffness"], 2 * point["damping_ratio"] * np.sqrt(point["stiffness"])
-    constant = point["time_constant"]
-    if scene.has_refsafe:
-        constant = max(constant, 2 * point["timestep"])
-    return (constant * point["damping_ratio"]) ** -2, 2 / constant
+    def effective(self, point: Point) -> tuple[float, float]:
+        """Give stiffness (1/s²) and damping (1/s) in effect."""
+        if point["stiffness"] > 0:
+            return point["stiffness"], 2 * point["damping_ratio"] * np.sqrt(point["stiffness"])
+        constant = point["time_constant"]
+        if self.has_refsafe:
+            constant = max(constant, 2 * point["timestep"])
+        return (constant * point["damping_ratio"]) ** -2, 2 / constant
 
 
 def catalogue() -> tuple[StabilityScene, ...]:
@@ -217,8 +215,7 @@ def _chain() -> StabilityScene:
     return StabilityScene("chain", mjcf, "chain", start, _graded(count), weights, depth_unit=0.1, has_limits=True)
 
 
-Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
-"""From places in [0, 1] to values."""
+Axis = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]  # from places in [0, 1] to values
 
 # In the planes of a single bounce the impedance is constant.
 CONSTANT = {"impedance_first": 0.9, "impedance_last": 0.9}

@@ -27,16 +27,16 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 import mjxgrad as mg
 from experiments.motion import advance
-from experiments.parallel import in_threads, num_cores
 from experiments.problems.comparison import over_keys
 from experiments.work_precision.cases import Case, case, own_case
 from experiments.work_precision.settings import Settings, Sizes
-from experiments.workspace import Workspace
+from experiments.workspace import Workspace, in_threads, num_cores
 from mjxgrad._mjx import mjx
 from mjxgrad._warnings import collected
 from mjxgrad.objective import Differentiated, Objective
 
 C, MG, MJX, ONSET = "C MuJoCo", "mg.step", "mjx.step", "mg.step, onset"
+Speeds = Float[np.ndarray, "batch nv"]
 Ends = tuple[Float[np.ndarray, "batch nq"], Float[np.ndarray, "batch nv"]]
 Integrator = Literal["Euler", "implicitfast", "RK4"]
 # jax 0.11.2 ended the process where threads that loaded at once traced the same function.
@@ -80,8 +80,19 @@ class Variant:
     has_gradient: bool = False  # whether the discrete gradient by the uncertain velocities comes with the outcome
 
 
+class _Timed:
+    """Something that took some seconds, in each of several repetitions."""
+
+    seconds: tuple[float, ...]
+
+    @property
+    def cost(self) -> float:
+        """Median of the times (s)."""
+        return float(np.median(self.seconds))
+
+
 @dataclass(frozen=True)
-class Point:
+class Point(_Timed):
     """One way of simulating a scene."""
 
     variant: Variant
@@ -90,11 +101,6 @@ class Point:
     # over their size; infinite if some state is not finite.
     error: float
     seconds: tuple[float, ...]  # wall time per simulated second of one state, of each repetition
-
-    @property
-    def cost(self) -> float:
-        """Median wall time per simulated second of one state (s)."""
-        return float(np.median(self.seconds))
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(_Timed):
     """One way of estimating a gradient; errors are over the norm of the reference."""
 
     estimator: str  # its name, with the derivative that it uses
@@ -122,11 +128,6 @@ class Estimate:
     bias_error: float  # what chance would make of no bias
     variance: float  # of one estimate, the trace
     seconds: tuple[float, ...]  # wall time of its rollouts, of each repetition
-
-    @property
-    def cost(self) -> float:
-        """Median wall time of its rollouts (s)."""
-        return float(np.median(self.seconds))
 
 
 @dataclass(frozen=True)
@@ -247,9 +248,7 @@ class Program:
             self._call = batched.lower(scene.model, np.zeros((batch, case.model.nv), dtype), np.int32(1)).compile()
         self.compile_seconds = time.perf_counter() - begun
 
-    def timed(
-        self, qvel: Float[np.ndarray, "batch nv"], timestep: float, tolerance: float | None = None
-    ) -> tuple[Any, float]:
+    def timed(self, qvel: Speeds, timestep: float, tolerance: float | None = None) -> tuple[Any, float]:
         """Return final positions and velocities, or outcomes and their slopes, and the wall time (s)."""
         begun, dtype = time.perf_counter(), np.dtype(self.variant.precision)
         options = {"opt.timestep": timestep, "opt.tolerance": tolerance or _TOLERANCE[self.variant.precision]}
@@ -265,9 +264,7 @@ class Native:
     def __init__(self, case: Case, variant: Variant):
         self.case, self.variant = case, variant
 
-    def timed(
-        self, qvel: Float[np.ndarray, "batch nv"], timestep: float, tolerance: float | None = None
-    ) -> tuple[Ends, float]:
+    def timed(self, qvel: Speeds, timestep: float, tolerance: float | None = None) -> tuple[Ends, float]:
         """Return final positions and velocities, and the wall time (s)."""
         case, model = self.case, _c_model(self.case, self.variant)
         model.opt.timestep, model.opt.tolerance = timestep, tolerance or _TOLERANCE["float64"]
@@ -296,9 +293,7 @@ def _c_model(case: Case, variant: Variant) -> mujoco.MjModel:
     return model
 
 
-def repeated(
-    program: Program | Native, qvel: Float[np.ndarray, "batch nv"], timestep: float, sizes: Sizes
-) -> tuple[Any, tuple[float, ...]]:
+def repeated(program: Program | Native, qvel: Speeds, timestep: float, sizes: Sizes) -> tuple[Any, tuple[float, ...]]:
     """Simulate at least twice, and again while it takes little time; a short first time only warms up."""
     result, first = program.timed(qvel, timestep)
     taken = [first] if first > sizes.seconds else []
@@ -348,7 +343,7 @@ class Truth:
         return _relative(self.case, self.ends, ends, self.scales)
 
 
-def _truths(case: Case, programs: dict[Variant, Program], qvel: Float[np.ndarray, "batch nv"]) -> dict[str, Truth]:
+def _truths(case: Case, programs: dict[Variant, Program], qvel: Speeds) -> dict[str, Truth]:
     """Simulate the references of both engines.
 
     MJX makes other contacts than C MuJoCo on some scenes, and then has a reference of its own. Where the same steps of
@@ -361,7 +356,7 @@ def _truths(case: Case, programs: dict[Variant, Program], qvel: Float[np.ndarray
     return {C: native, MG: native if is_same else _truth(case, qvel, programs[Variant(MG, "RK4")], _FINEST)}
 
 
-def _truth(case: Case, qvel: Float[np.ndarray, "batch nv"], program: Program | Native, finest: int) -> Truth:
+def _truth(case: Case, qvel: Speeds, program: Program | Native, finest: int) -> Truth:
     """Simulate at a fine step, at two and at four times it."""
     steps = [factor * case.timestep / finest for factor in (1, 2, 4)]
     runs = [program.timed(qvel, step, _REFERENCE_TOLERANCE)[0] for step in steps]
@@ -392,7 +387,10 @@ def _rms(differences: Float[np.ndarray, "batch nv"]) -> float:
 
 
 class Recorded(Objective):
-    """Rollouts that were made before, as an objective: its noise is the number of a rollout, drawn with replacement."""
+    """Rollouts that were made before, as an objective: its noise is the number of a rollout, drawn with replacement.
+
+    The derivative of a cost by the parameters is the recorded one.
+    """
 
     costs: Float[Array, " rollouts"]
     gradients: Float[Array, "rollouts dim"]
@@ -401,19 +399,15 @@ class Recorded(Objective):
     dim: int | None = eqx.field(static=True)
 
     def sample_noise(self, key: PRNGKeyArray) -> Int[Array, ""]:
-        """Draw a rollout."""
         return jax.random.randint(key, (), 0, len(self.costs))
 
     def value(self, params: Float[Array, " dim"], noise: Int[Array, ""]) -> Float[Array, ""]:
-        """Return its cost, whose derivative by the parameters is the recorded one."""
         return self.costs[noise] + self.gradients[noise] @ (params - jax.lax.stop_gradient(params))
 
     def score(self, params: Float[Array, " dim"], noise: Int[Array, ""]) -> Float[Array, " dim"]:
-        """Return that of its noise."""
         return self.noise[noise] / self.stddev**2
 
     def differentiate(self, params: Float[Array, " dim"], noise: Int[Array, ""]) -> Differentiated:
-        """Return cost, derivative and score as they were recorded."""
         unchanged = Partial(lambda vector: vector)
         return Differentiated(
             self.costs[noise], self.gradients[noise], self.score(params, noise), self.stddev, unchanged

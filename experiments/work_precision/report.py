@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from experiments.parallel import num_cores
 from experiments.report import Table, tabulated
 from experiments.theme import DEFAULT, FIRST, MUTED, REFERENCE, ZEROTH, Drawings, logarithmic, subplots
 from experiments.words import joined, percent, quantity
 from experiments.work_precision.measure import MG, MJX, ONSET, C, Course, Estimate, Outcome, Point
+from experiments.workspace import num_cores
 
 _One = TypeVar("_One", Point, Estimate)
 
@@ -119,7 +119,9 @@ def tables(outcome: Outcome) -> list[Table]:
         for target in targets:
             best, share = [_best(course, name, target) for name in (MG, MJX, C)], percent(target)
             nothing = "?" if course.floor(MG) > target else "–"
-            row[f"motion to {share}"] = nothing if best[0] is None else _way(best[0])
+            if (own := best[0]) is not None:
+                nothing = f"{own.variant.integrator}, {own.variant.precision}, {1e3 * own.timestep:g} ms"
+            row[f"motion to {share}"] = nothing
             costs = "; ".join("–" if one is None else _milliseconds(one.cost) for one in best)
             row[f"ms per s; mjx.step; C MuJoCo, to {share}"] = costs
             row[f"gradient to {share}"] = _choice(cheapest(course.estimates, target))
@@ -138,10 +140,6 @@ def _best(course: Course, library: str, target: float) -> Point | None:
     if course.floor(library) > target:
         return None
     return fastest((point for point in course.points if point.variant.library == library), target)
-
-
-def _way(point: Point) -> str:
-    return f"{point.variant.integrator}, {point.variant.precision}, {1e3 * point.timestep:g} ms"
 
 
 def _choice(choice: Choice | None) -> str:
@@ -190,9 +188,8 @@ def _all_scenes(outcome: Outcome):
     """Draw the least time to each error, scene by scene: of the motion on the left, of the gradient on the right."""
     targets, count = sorted(outcome.settings.targets, reverse=True), len(outcome.courses)
     figure, axes = subplots(1, 2, height=1.6 + 0.4 * count, sharey=True)
-    logarithmic(
-        axes[0, 0].xaxis, axes[0, 1].xaxis
-    )  # before a curve that may be empty, which a linear axis puts about zero
+    # Before a curve that may be empty, which a linear axis puts about zero.
+    logarithmic(axes[0, 0].xaxis, axes[0, 1].xaxis)
     ways = dict.fromkeys(one.estimator for course in outcome.courses for one in course.estimates)
     for i, course in enumerate(outcome.courses):
         for axis, names, markers, shift in (

@@ -23,7 +23,7 @@ from experiments.stability.measure import (
     unbalanced,
 )
 from experiments.stability.report import drawings, reasons
-from experiments.stability.scenes import DEFAULTS, FIELDS, Points, catalogue, configure, points
+from experiments.stability.scenes import DEFAULTS, FIELDS, Points, catalogue, points
 from experiments.workspace import Workspace
 
 SCENES = {scene.name: scene for scene in catalogue()}
@@ -80,7 +80,7 @@ def test_a_solve_is_judged_by_the_forces_of_its_state_and_not_by_those_it_report
     scene, grid = SCENES["ball"], _points(timestep=1e-3)
     model = scene.model()
     data = mujoco.MjData(model)
-    configure(scene, model, data, grid[0])
+    scene.configure(model, data, grid[0])
     data.qpos[:], data.qvel[:] = -1e-3, -1.0
     mujoco.mj_forward(model, data)
     fields = {name: np.array(getattr(model, name))[None] for name in FIELDS} | {"timestep": np.array([1e-3])}

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from experiments.parallel import in_threads, num_compilers
+from experiments.workspace import in_threads, num_compilers
 
 
 def test_results_keep_the_order_of_the_items():
