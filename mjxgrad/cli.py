@@ -5,10 +5,8 @@ import functools
 import importlib
 import importlib.util
 import os
-import select
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,9 +22,6 @@ except ImportError:
 
 Switch = Annotated[bool, cyclopts.Parameter(negative="")]
 Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
-
-
-_GRACE = 0.7  # s, for the main thread to hear of a signal
 
 
 class CommandError(Exception):
@@ -48,19 +43,17 @@ def main(arguments: list[str] | None = None) -> int:
     interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
     interruptions: list[int] = []
-    began, ends = os.pipe()
-    os.set_blocking(ends, False)
 
-    def interrupt(*given: Any) -> None:
-        interruptions.append(given[0])
-        signal.default_int_handler(*given)
+    def interrupt(number: int, _: Any) -> None:
+        is_first = not interruptions
+        interruptions.append(number)
+        os.write(2, b"interrupted: writing what there is; once more ends at once\n" if is_first else b"interrupted\n")
+        if not is_first:
+            os._exit(130)
+        raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
-    signal.set_wakeup_fd(ends, warn_on_full_buffer=False)
-    # A search for parameters may have found some while it is within XLA.
-    grace = _GRACE if "identify" not in (arguments or sys.argv) else 60 * _GRACE
-    threading.Thread(target=_watch, args=(began, interruptions, grace), daemon=True).start()
     status = 2
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
@@ -81,22 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
     # The library refuses by these errors, in a sentence; any other error is a bug.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
-    finally:
-        signal.set_wakeup_fd(-1)
-        os.close(ends)
     return status
-
-
-def _watch(pipe: int, heard: list[int], grace: float) -> None:
-    """End the process at a second signal, or where the first finds the main thread within XLA, with nothing measured yet."""
-    if os.read(pipe, 1):
-        os.write(2, b"interrupted: writing what there is; once more ends at once\n")
-        if select.select([pipe], [], [], grace)[0] or heard:
-            heard = heard if os.read(pipe, 1) == b"" else []
-        if not heard:
-            os.write(2, b"interrupted\n")
-            os._exit(130)
-    os.close(pipe)
 
 
 def _say(text: str) -> None:
@@ -128,12 +106,12 @@ def check(
         html: write a page to this file.
         quick: only fast checks, in seconds: contact, time step, parts without effect, one value and derivative of the cost.
         mjx: compare a step by MJX with C MuJoCo's, too, which takes up to a minute to compile.
-        budget: duration in s once the scene is loaded; the report names measurements that are left out.
+        budget: duration in s, about; the report names measurements that are left out.
         seed: seed of all random numbers.
     """
     _writable(html, is_page=True)
     log = _timed()
-    log(f"takes up to {10 if quick else budget + 10:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
+    log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
     print(verdict, flush=True)

@@ -3,7 +3,9 @@
 import contextlib
 import dataclasses
 import functools
+import math
 import os
+import string
 import textwrap
 import time
 import warnings
@@ -97,18 +99,17 @@ class Verdict(Paged):
     def _details(self) -> dict[str, str]:
         """Return the detailed report: measurements, scene, time step."""
         found = {"The scene": self.scene.summary(), "Time step and contacts": self.stability.summary()}
-        if not (self.measured and self.measured.lines):
+        if self.measured is None:
             return found
         lines = [f"Outcomes: {'; '.join(self.outcomes)}.", *map(_noise_text, self.measured.noises)]
         return {"What was measured": "\n".join(lines), **found}
 
     def as_html(self) -> str:
         """Return the verdict as a self-contained page; needs `mjxgrad[render]`."""
-        figure = telling(self.measured, self.outcomes) if self.measured and self.measured.lines else Block()
-        faults = [one.text for one in self.findings if one.is_fault]
-        notes = [one.text for one in self.findings if not one.is_fault]
+        figure = [telling(self.measured, self.outcomes)] if self.measured else []
+        faults, notes = ([one.text for one in self.findings if one.is_fault == wanted] for wanted in (True, False))
         folded = [Block(folded=title, code=text) for title, text in self._details().items()]
-        blocks = [figure, Block(faults=faults, items=notes), Block(title="To paste", code=self.code), *folded]
+        blocks = [*figure, Block(faults=faults, items=notes), Block(title="To paste", code=self.code), *folded]
         return page(self.headline, f"mjxgrad check {self.name}", blocks)
 
 
@@ -150,7 +151,7 @@ def check(
             motions are then simulated from their start. None uses random mixes of final positions and velocities.
         derivatives: whether to measure derivatives; False looks at motions alone, and calls a cost once.
         mjx: whether to compare a step by MJX with C MuJoCo's, too; it takes up to a minute to compile.
-        budget: approximate duration in s once the scene is loaded. Slow scenes get fewer steps. The verdict names
+        budget: approximate duration in s, half of it for motions and derivatives. Slow scenes get fewer steps. The verdict names
             measurements that are left out.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts.
@@ -169,6 +170,7 @@ def check(
     function("log", log, "text")
     function("cost", None if isinstance(cost, str) else cost, "trajectory")
     say = log or (lambda _: None)
+    begun = time.perf_counter()
     rng = np.random.default_rng(whole("seed", seed, 0))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -182,32 +184,35 @@ def check(
     found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
-    names, outcomes = _outcomes(scene, outcome, rng)
-    if cost is not None and (motions.bad_steps < 0).any():
+    names, outcomes = outcomes_of(scene, outcome, rng)
+    is_any_sound = (motions.bad_steps < 0).any()
+    if cost is not None and is_any_sound:
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
     measured, prices = None, {}
-    if derivatives and (motions.bad_steps < 0).any():
+    if derivatives and is_any_sound:
         say("measuring derivatives by C MuJoCo")
-        mover = Mover(scene, _BATCH, outcomes, started + budget)
+        mover = Mover(scene, _BATCH, outcomes, max(begun + budget, started + budget / 2))
+        settings = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
         with contextlib.suppress(TimeoutError, KeyboardInterrupt):
-            measured = measure(
-                scene, motions, mover, rng, from_start=cost is not None, seconds=_MOVED * budget, log=say
-            )
-        found += findings.measured_findings(measured) if measured and measured.lines else ()
-        found += findings.left_out_findings(measured if measured and measured.lines else None, budget)
-    if mjx and (motions.bad_steps < 0).any():
+            measured = measure(scene, motions, mover, rng, **settings)
+        measured = measured if measured and measured.lines else None
+        found += findings.measured_findings(measured) if measured else ()
+        found += findings.left_out_findings(measured, budget)
+    if mjx and is_any_sound:
         say("compiling a step by MJX")
         found.append(findings.engine_finding(scene, motions))
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
-    advice = findings.recommend(motions, stability, measured, slots)
-    told = slopes(measured.lines) if measured else ()
-    if scene.model.nu and (motions.bad_steps < 0).any():
+    if scene.model.nu and is_any_sound:
         with contextlib.suppress(KeyboardInterrupt):
-            prices = seconds_of(scene, advice.horizon)
-            advice = findings.recommend(motions, stability, measured, slots, prices["slope"] / prices["discrete"])
-            found.append(findings.price_finding(prices, told, advice.horizon))
+            prices = seconds_of(scene)
+    price = prices["slope"] / prices["discrete"] if prices else math.inf
+    advice = findings.recommend(motions, stability, measured, slots, price)
+    told = slopes(measured.lines) if measured else ()
+    if prices:
+        prices = {kind: advice.horizon * seconds for kind, seconds in prices.items()}
+        found.append(findings.price_finding(prices, told, advice.horizon))
     order = {"slope": 0, "price": 1, "left_out": 3, "not_measured": 3}
     path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
@@ -240,8 +245,8 @@ def _warned(caught: list[warnings.WarningMessage]) -> Iterator[Finding]:
         yield Finding("note", f"{text[:1].upper()}{text[1:]}.")
 
 
-def _outcomes(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tuple[tuple[str, ...], Outcomes]:
-    """Return the function from a trajectory to its outcomes, and their names."""
+def outcomes_of(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tuple[tuple[str, ...], Outcomes]:
+    """Return the names of outcomes, and the function from a trajectory to them: the cost, or mixes of the final state."""
     if cost is not None:
         return ("the cost",), lambda trajectory: checked_cost(cost(trajectory), len(trajectory.ctrl)).sum()[None]
     model = scene.mj_model
@@ -272,7 +277,7 @@ def _noise_text(noise: Noise) -> str:
 
 
 def _setup(scene: Scene, advice: Recommendation, path: str, more: str = "") -> str:
-    """Return the beginning of a program with the recommended settings, up to its task, with further imports."""
+    """Return the beginning of a program with the recommended settings, up to its start and its task."""
     # On GPUs MJX is faster; elsewhere what compiles nothing.
     engine = QUICK if device.is_cpu() else None
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts, "engine": engine}
@@ -325,40 +330,21 @@ def program(verdict: Verdict, path: str, video: str) -> str:
     timestep = advice.timestep or verdict.motions.timestep
     horizon, held = min(300, max(50, round(0.5 / timestep))), max(1, round(0.05 / timestep))
     more = "import optax\n\nmg.keep_compiled()  # on disk, so that the next run starts at once"
-    name = repr(Path(path).name)[1:-1].replace('"', "'")  # within a docstring
-    return f"""\
-\"\"\"{name}: controls that move it, found by {advice.estimator} gradients through contact; and their video.\"\"\"
-
-import functools
-
-{_setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, more)}
-low, high = jnp.where(jnp.isfinite(scene.ctrlrange), scene.ctrlrange, jnp.array([-1.0, 1.0])).T
-home = {_home(verdict.scene)}
-
-
-def controls(knots):  # held for {held} time steps each, within the actuators' ranges; those at home where a knot is zero
-    knots = knots + jnp.arctanh(jnp.clip((2 * home - low - high) / (high - low), -0.95, 0.95))
-    return jnp.repeat((low + high) / 2 + (high - low) / 2 * jnp.tanh(knots), {held}, axis=0)[: task.horizon]
-
-
-knots = jnp.zeros(({-(-horizon // held)}, scene.model.nu))
-result = mg.optimise(
-    mg.parameter_noise(lambda params: task.run(controls(params["knots"])).cost, stddev={advice.stddev}),
-    {{"knots": knots}},
-    jax.random.key(0),
-    estimator=functools.partial(mg.estimators.{advice.estimator}, num_samples=16),
-    optimiser=optax.adam(0.1),
-    num_steps=30,
-    log=lambda step, metrics: step % 10 or print(step, metrics["cost"]),
-)
-course = mg.rollout(scene, start, controls(result.params["knots"]), contact=task.contact)
-print("cost", cost(course), "from", task.run(controls(knots)).cost)
-mg.render.write_video({video!r}, mg.render.frames(scene, course.qpos))
-"""
+    parts = {
+        "name": repr(Path(path).name)[1:-1].replace('"', "'"),  # within a docstring
+        "setup": _setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, more),
+        "home": _home(verdict.scene),
+        "held": held,
+        "num_knots": -(-horizon // held),
+        "stddev": advice.stddev,
+        "estimator": advice.estimator,
+        "video": repr(video),
+    }
+    return string.Template(Path(__file__).with_name("program.txt").read_text("utf-8")).substitute(parts)
 
 
 def telling(measured: Measured, outcomes: Sequence[str]) -> Block:
-    """Draw the line on which MuJoCo's derivative is farthest from the slope, or the line with the largest jump."""
+    """Draw the outcome along the most telling line, and its derivatives."""
     line, time, outcome = _most_telling(measured)
     words, of = outcomes[outcome], (slice(None), time, outcome)
     unit = _UNITS.get(words.partition(" ")[0], "units of the cost")
@@ -368,7 +354,24 @@ def telling(measured: Measured, outcomes: Sequence[str]) -> Block:
     )
     caption += " Dashed: a jump." * bool(len(line.jumps.places))
     x, fine, (smooth, plain) = line.plain.parameters, line.fine.outcomes[of], line.plain.derivatives[:, *of]
-    panel = functools.partial(_panel, x, line.jumps.places)
+
+    def panel(what: str, name: str, curve: np.ndarray, dots: dict[str, tuple]) -> Any:
+        """Draw dots over a grey curve; of several kinds, those beyond its range lie on the edge."""
+        import matplotlib.pyplot as plt
+
+        figure, axis = plt.subplots(figsize=_SIZE)
+        axis.plot(x, curve, color="#8b94a1", lw=1.4, label=name)
+        axis.margins(y=1 / 3)
+        low, high = axis.get_ylim() if len(dots) > 1 else (-np.inf, np.inf)
+        axis.set_autoscaley_on(len(dots) == 1)
+        for label, (values, colour, marker) in dots.items():
+            axis.plot(x, np.clip(values, low, high), marker, color=colour, ms=3, mew=0, label=label, clip_on=False)
+        for place in line.jumps.places:
+            axis.axvline(place, color="#8b94a1", lw=1, ls="--")
+        axis.set(xlabel="place on the line, −1 to 1", ylabel=what)
+        figure.legend(loc="outside upper right", ncols=3)
+        return figure
+
     moved = {"MuJoCo": (line.plain.outcomes[of], INK, "o")}
     derived = {"discrete": (plain, "#d55e00", "s"), "slope": (smooth, "#009e73", "o")}
     drawings = [
@@ -379,8 +382,8 @@ def telling(measured: Measured, outcomes: Sequence[str]) -> Block:
 
 
 def _most_telling(measured: Measured) -> tuple[Line, int, int]:
-    jumping = [line for line in measured.lines if len(line.jumps.places)]
-    if jumping:
+    """Return the line of the largest jump, or that on which the discrete derivative is farthest off; a time and an outcome."""
+    if jumping := [line for line in measured.lines if len(line.jumps.places)]:
         line = max(jumping, key=lambda one: float(one.jumps.sizes.max()))
         sizes = np.abs(line.jumps.after - line.jumps.before)[line.jumps.largest]
         return line, len(measured.times) - 1, int(sizes.argmax())
@@ -388,23 +391,3 @@ def _most_telling(measured: Measured) -> tuple[Line, int, int]:
     errors = [np.where(one.is_resolved(), one.relative_error[1], 0) for one in compared]
     number, time, outcome = np.unravel_index(int(np.argmax(errors)), np.shape(errors))
     return measured.lines[int(number)], int(time), int(outcome)
-
-
-def _panel(x: np.ndarray, jumps: np.ndarray, what: str, fine: str, curve: np.ndarray, dots: dict[str, tuple]) -> Any:
-    """Draw dots by name, colour and marker over a grey curve; of several kinds, those beyond its range lie on the edge."""
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=_SIZE)
-    axis.plot(x, curve, color="#8b94a1", lw=1.4, label=fine)
-    axis.margins(y=1 / 3)
-    low, high = -np.inf, np.inf
-    if len(dots) > 1:  # beside other derivatives the slope sets the range
-        low, high = axis.get_ylim()
-        axis.set_autoscaley_on(False)
-    for name, (values, colour, marker) in dots.items():
-        axis.plot(x, np.clip(values, low, high), marker, color=colour, ms=3, mew=0, label=name, clip_on=False)
-    for place in jumps:
-        axis.axvline(place, color="#8b94a1", lw=1, ls="--")
-    axis.set(xlabel="place on the line, −1 to 1", ylabel=what)
-    figure.legend(loc="outside upper right", ncols=3)
-    return figure

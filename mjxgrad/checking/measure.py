@@ -1,12 +1,12 @@
 """Measurements of a scene's derivatives, along lines and under noise, by the library's diagnostics."""
 
 import contextlib
-import dataclasses
 import functools
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -120,13 +120,10 @@ def slopes(lines: Sequence[Line]) -> tuple[Slope, ...]:
             is_clear = (size > line.fine.resolution) & (spread <= np.maximum(_CLEAR * size, line.fine.resolution))
             mean = comparison.mean[at]
             off_by = np.maximum(np.min(truths, axis=0) - mean, mean - np.max(truths, axis=0))
-            off_by = np.maximum(
-                off_by, np.where(np.isnan(off_by), np.inf, comparison.mean_error[at])
-            )  # luck is no merit
+            off_by = np.maximum(off_by, comparison.mean_error[at])  # luck is no merit
+            share = np.nan_to_num(off_by / np.maximum(size, line.fine.resolution), nan=1.0)
             counts.append(int(np.isfinite(comparison.derivatives[at]).all(axis=(1, 2)).sum()))
-            errors.append(
-                np.minimum(np.nan_to_num(off_by / np.maximum(size, line.fine.resolution), nan=1.0), 1.0)[is_clear]
-            )
+            errors.append(np.minimum(share, 1.0)[is_clear])
         found.append(Slope(kind, np.concatenate(errors), max(counts)))
     return tuple(found)
 
@@ -181,28 +178,29 @@ def measure(
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
     directions = [_direction(scene, rng, num_steps, motions.touch_speed or 1.0, i) for i in range(_NUM_LINES)]
     softer = [SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))] if scene.pairs else []
-    asked: list[tuple[str, Callable[..., Line | Noise]]] = [
-        (f"a line along {one[0]}", functools.partial(probe.line, *at, *one))
-        for at, one in zip(chosen, directions, strict=True)
-    ]
+    lines, noises, left_out, end = [], [], [], mover.end
+
+    def line(*task: Any) -> None:
+        lines.append(probe.line(*task))
+
+    def noise(stddev: float, stiffness: float | None, own_rng: Generator) -> None:
+        noises.append(probe.noise(*chosen[0], stddev, stiffness, own_rng, nearest(slopes(lines))))
+
+    both = zip(chosen, directions, strict=True)
+    asked: list[tuple[str, Callable, tuple]] = [(f"a line along {one[0]}", line, (*at, *one)) for at, one in both]
     for stddev, stiffness in [(stddev, soft) for soft in [None, *softer] for stddev in STDDEVS]:
         words = "" if stiffness is None else f" with contacts at {format_number(stiffness)} 1/s²"
         own_rng = np.random.default_rng(int(rng.integers(2**31)))
-        asked.append(
-            (f"noise of {stddev:g}{words}", functools.partial(probe.noise, *chosen[0], stddev, stiffness, own_rng))
-        )
+        asked.append((f"noise of {stddev:g}{words}", noise, (stddev, stiffness, own_rng)))
     # In order of importance, since the last are left out where time is short: a line, noise, then the others.
     asked.insert(1, asked.pop(_NUM_LINES))
-    found, left_out, end = [], [], mover.end
-    of_kind = lambda kind: tuple(one for one in found if isinstance(one, kind))  # noqa: E731
-    so_far = lambda: Measured(np.array(lengths) * motions.timestep, of_kind(Line), of_kind(Noise), tuple(left_out))  # noqa: E731
     # One after the other: two at once deadlocked on dm_control's humanoid (two cores, jax 0.10.2).
-    for number, (words, task) in enumerate(asked):
+    for number, (words, measure_one, task) in enumerate(asked):
         # There is a verdict in any case: of a line, and its slope by the fewest motions.
-        mover.end, mover.is_needed = end, not found and not left_out
+        mover.end, mover.is_needed = end, number == 0
         try:
-            found.append(task(nearest(slopes(of_kind(Line)))) if "noise" in words else task())
-            errors = (f"{one.kind} {one.error:.1%} off" for one in slopes(of_kind(Line)) if one.errors.size)
+            measure_one(*task)
+            errors = (f"{one.kind} {one.error:.1%} off" for one in slopes(lines) if one.errors.size)
             log("; ".join([f"{number + 1} of {len(asked)}: {words}", *errors]))
         except TimeoutError:
             left_out.append(words)
@@ -210,7 +208,7 @@ def measure(
             log("interrupted: the verdict is of what was measured")
             left_out.append(words)
             end = 0.0
-    return so_far()
+    return Measured(np.array(lengths) * motions.timestep, tuple(lines), tuple(noises), tuple(left_out))
 
 
 def _lengths(
@@ -235,10 +233,7 @@ def _repeated(state: State, size: int) -> State:
 
 
 def _direction(scene: Scene, rng: Generator, num_steps: int, speed: float, number: int) -> tuple[str, Direction]:
-    """Draw a change of the start, of the controls, or a wide one of both; the line runs from −1 to 1 times it.
-
-    Its length moves the first touch through several steps, so that it meets the teeth of MuJoCo's motion.
-    """
+    """Draw a change of the start, of the controls, or a wide one of both; the first touch moves through several teeth."""
     model, timestep = scene.model, float(scene.model.opt.timestep)
     units = rng.normal(size=model.nv), rng.normal(size=model.nv), smooth(rng, num_steps, model.nu, timestep)
     sizes = _TEETH * timestep * speed, _SPEED_SHARE * speed, _CONTROL_SHARE * half_range(scene)
@@ -275,14 +270,14 @@ class _Probe:
 
         places = phases((-1.0, 1.0), self.mover.size)
         own, fine = along("discrete", places), along("fine", places)
-        found = [self._in_time(functools.partial(along, "slope"), places), own, fine]
+        slope = self._in_time(functools.partial(along, "slope"), places)
         self.mover.is_needed = False
         spreads = np.nanstd(own.outcomes, axis=0)
         is_felt = spreads > _UNFELT * np.nanmax(spreads, initial=_UNFELT)
-        *own, fine = (one.where(is_felt) for one in found)
+        own, fine = own.where(is_felt), fine.where(is_felt)
         # Both are seen at the same motions.
-        derivatives = [own[0].derivatives, np.where(np.isnan(own[0].derivatives), np.nan, own[1].derivatives)]
-        plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own[1], fine))
+        derivatives = [slope.derivatives, np.where(np.isnan(slope.derivatives), np.nan, own.derivatives)]
+        plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own, fine))
         centre = np.nanmean(fine.outcomes[:, -1], axis=0)
         # Outcomes at rest vary by rounding alone.
         moves_start = direction.positions.any() or direction.velocities.any()
@@ -295,8 +290,8 @@ class _Probe:
             jumps = jumps_along(ends, (-1.0, 1.0), **sizes, smallest=_SMALLEST_JUMP)
         pose = self.motions.poses[motion] + (f", {begin * self.motions.timestep:.3g} s on" if begin else "")
         changed = self._changed(state, controls, direction, jumps)
-        growth = np.nanmedian(own[0].growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
-        return Line(pose, words, plain, shorter, jumps, changed, growth, own[1].num_diverged + fine.num_diverged)
+        growth = np.nanmedian(slope.growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
+        return Line(pose, words, plain, shorter, jumps, changed, growth, own.num_diverged + fine.num_diverged)
 
     def _in_time(self, move: Callable[..., Moved], values: np.ndarray) -> Moved:
         """Move as many values of a batch, evenly spread, as there is time for, an eighth at least; the others are NaN."""
@@ -322,17 +317,15 @@ class _Probe:
         return tuple(sorted(sides[0] ^ sides[1]))
 
     def noise(
-        self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: Generator, kind: Kind = "slope"
+        self, motion: int, begin: int, stddev: float, stiffness: float | None, rng: Generator, kind: Kind
     ) -> Noise:
         """Estimate one derivative by both orders, with noise on all controls (or the initial velocities)."""
         state, controls = self._at(motion, begin)
-        size, steps, half = self.mover.size, self.lengths[-1], half_range(self.scene)
-        has_controls = self.scene.model.nu > 0
-        still = np.zeros(state.qvel.size)
-        timestep = self.motions.timestep
-        wiggle = smooth(rng, steps, len(half), timestep) if has_controls else rng.normal(size=(1, still.size))
+        half, timestep, still = half_range(self.scene), self.motions.timestep, np.zeros(state.qvel.size)
+        has_controls = half.size > 0
+        wiggle = smooth(rng, len(controls), len(half), timestep) if has_controls else rng.normal(size=(1, still.size))
         along = wiggle / np.sqrt((wiggle**2).sum())
-        noise = stddev * rng.normal(size=(size, *along.shape))
+        noise = stddev * rng.normal(size=(self.mover.size, *along.shape))
         direction = Direction(still, still, along * half) if has_controls else Direction(still, along[0], controls)
         softness = None if stiffness is None else Softness(stiffness=stiffness, damping_ratio=1.0)
 
@@ -345,14 +338,13 @@ class _Probe:
             return self.mover.move(kind, states, noisy, direction, self.lengths, softness)
 
         found = under("discrete", noise)
+        derivatives = found.derivatives
         if kind == "slope":
-            found = dataclasses.replace(
-                found, derivatives=self._in_time(functools.partial(under, kind), noise).derivatives
-            )
+            derivatives = self._in_time(functools.partial(under, kind), noise).derivatives
         # An outcome depends only on the noise of earlier steps.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]
-        first, zeroth = estimates(found.outcomes, found.derivatives, scores[:, :, None])
+        first, zeroth = estimates(found.outcomes, derivatives, scores[:, :, None])
         times = np.array(self.lengths) * timestep
         return Noise(stddev, stiffness, first, zeroth, crossover(times, first, zeroth))
 

@@ -161,30 +161,24 @@ def run(
     return path if follow is None else path | {"change": found["change"]}
 
 
-def seconds_of(scene: Scene, num_steps: int) -> dict[str, float]:
-    """Return how long a "motion" and its gradients by the controls take, by kind: one of a batch by C MuJoCo, from the start."""
-    model, timed, rng = scene.mj_model, min(num_steps, _TIMED), np.random.default_rng(0)
-    pool = pool_of(model)
+def seconds_of(scene: Scene) -> dict[str, float]:
+    """Return how long a step of a "motion" and of its gradients takes, by kind: in a batch by C MuJoCo, from the start."""
+    model, pool = scene.mj_model, pool_of(scene.mj_model)
     num = 2 * pool.num_threads
     _, *start = next(_starts(scene, scene.to_mujoco()))
     numbers = {name: np.asarray(value)[None] for name, value in changed_numbers(scene).items()}
     given = {name: np.tile(x, (num, 1)) for name, x in zip(("qpos", "qvel", "act"), start, strict=True)}
     given["time"] = np.zeros((num, 1))
-    controls = key_controls(model) + 0.1 * half_range(scene) * rng.normal(size=(num, timed, model.nu))
-    product = functools.partial(pool.product, wanted=("ctrl",) * bool(model.nu))
-    calls, found = {"motion": pool.run} | {kind: functools.partial(product, gradient=kind) for kind in KINDS}, {}
+    # About those of the first key frame, or zero, within the actuators' ranges.
+    home = np.clip(model.key_ctrl[0] if model.nkey else np.zeros(model.nu), *np.asarray(scene.ctrlrange, float).T)
+    controls = home + 0.1 * half_range(scene) * np.random.default_rng(0).normal(size=(num, _TIMED, model.nu))
+    calls, found = {"motion": pool.run} | {kind: functools.partial(pool.product, gradient=kind) for kind in KINDS}, {}
     for kind, call in calls.items():
-        for steps in (2, timed):  # the first begins with threads and memory
+        for steps in (2, _TIMED):  # the first begins with threads and memory
             began = time.perf_counter()
             call(numbers, given, {"ctrl": controls[:, :steps]})
-            found[kind] = (time.perf_counter() - began) / num * num_steps / steps
+            found[kind] = (time.perf_counter() - began) / num / steps
     return found
-
-
-def key_controls(model: mujoco.MjModel) -> Float[np.ndarray, " nu"]:
-    """Return the controls of the first key frame, or zeros, within the actuators' ranges."""
-    low, high = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
-    return np.clip(model.key_ctrl[0] if model.nkey else np.zeros(model.nu), low, high)
 
 
 def held(path: _States) -> tuple[_States, Int[np.ndarray, " motions"]]:
@@ -283,14 +277,11 @@ class Direction:
 
 @dataclass(frozen=True)
 class Moved:
-    """Outcomes of a batch of motions at several times, and their derivatives along a direction; NaN for those that diverged.
-
-    `growth` is the growth of the tangent of the state relative to the start.
-    """
+    """Outcomes of a batch of motions at several times, and their derivatives along a direction; NaN for those that diverged."""
 
     outcomes: Float[np.ndarray, "motions times outcomes"]
     derivatives: Float[np.ndarray, "motions times outcomes"]
-    growth: Float[np.ndarray, "motions times"]
+    growth: Float[np.ndarray, "motions times"]  # of the tangent of the state, relative to the start
     num_diverged: int
 
     def where(self, is_felt: Bool[np.ndarray, "times outcomes"]) -> "Moved":
@@ -311,12 +302,12 @@ class Mover:
     is_needed: bool = False
 
     def __post_init__(self):
-        self._judge, self._warm, self._spent = functools.cache(self._judge_at), set(), {}
+        self._judge, self._spent = functools.cache(self._judge_at), {}
 
     def seconds(self, kind: Kind, num_steps: int) -> float:
         """Return how long steps of motions, all added up, will take with a kind of derivative, by the batches so far."""
-        steps, seconds = self._spent.get(kind, (1, 0.0))
-        return num_steps * seconds / steps
+        steps, seconds = self._spent.get(kind, (0, 0.0))
+        return num_steps * seconds / max(steps, 1)
 
     def move(
         self,
@@ -343,18 +334,16 @@ class Mover:
         refined = REFINED if kind == "fine" else 1
         started = time.perf_counter()
         found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)
-        if kind in self._warm:  # the first begins with threads and memory, and is not timed
-            before = self._spent.get(kind, (0, 0.0))
-            self._spent[kind] = before[0] + num * steps, before[1] + time.perf_counter() - started
-        self._warm.add(kind)
+        before = self._spent.get(kind)  # none of the first, which begins with threads and memory, and is not timed
+        spent = num * steps, time.perf_counter() - started
+        self._spent[kind] = (before[0] + spent[0], before[1] + spent[1]) if before else (0, 0.0)
         course = found.pop("change", np.full((num, steps, len(change)), np.nan))
         path, bad_steps = held({name: x[:, ::refined] for name, x in found.items()})
         bad = bad_steps >= 0
         course = np.concatenate([np.tile(change, (num, 1, 1)), np.where(bad[:, None, None], 0.0, course)], axis=1)
         batch = bad, (*path.values(), controls), course, pushes
-        filled = jax.tree.map(
-            lambda x: np.resize(x, (self.size, *x.shape[1:])), batch
-        )  # so that one program judges all
+        # So that one program judges all.
+        filled = jax.tree.map(lambda x: np.resize(x, (self.size, *x.shape[1:])), batch)
         outcomes, derivatives = (np.asarray(x)[:num] for x in self._judge(tuple(lengths))(*filled))
         growth = np.linalg.norm(course[:, list(lengths)], axis=2) / (np.linalg.norm(change) or 1.0)
         return Moved(outcomes, derivatives, growth, int(bad.sum()))

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function, is_known, real, whole
 from mjxgrad._text import Paged, aligned, duration, format_number
-from mjxgrad.checking.check import Source, _outcomes, in_double
+from mjxgrad.checking.check import Source, in_double, outcomes_of
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import exact_text, percent
 from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range, seconds_of, touching_exactly
@@ -57,7 +57,7 @@ def scene_task(
     if start is not None:
         scene = eqx.tree_at(lambda s: s.data.ctrl, scene, jnp.asarray(model.key(start).ctrl, state.qpos.dtype))
     if cost is None:
-        outcomes = _outcomes(scene, None, np.random.default_rng(seed))[1]
+        outcomes = outcomes_of(scene, None, np.random.default_rng(seed))[1]
         cost = lambda trajectory: outcomes(trajectory)[0]  # noqa: E731
     cost = named_cost(scene, cost) if isinstance(cost, str) else cost
     usual = int(np.clip(round(_SECONDS / model.opt.timestep), _FEWEST_STEPS, _MOST_STEPS))
@@ -66,18 +66,12 @@ def scene_task(
 
 
 class CommonShift(OpenLoop):
-    """The cost under noise on every control, as a function of a common shift of all controls along one direction.
-
-    The gradient by single controls is hundreds of small numbers; for a single number an interval is informative.
-    """
+    """The cost under noise on every control, by a common shift of all along one direction: a single number, with an interval."""
 
     direction: Float[Array, " nu"]
 
     def unravel(self, params: Float[Array, " dim"]) -> Float[Array, "horizon nu"]:
         return jnp.broadcast_to(self.task.scene.data.ctrl + params[0] * self.direction, self.noise_shape)
-
-    def score(self, params: Float[Array, " dim"], noise: PyTree) -> Float[Array, " dim"]:
-        return self.pull_back_at(params, None)(self._noise_score(params, noise))
 
     def pull_back_at(self, params: Float[Array, " dim"], states: PyTree) -> Partial:
         return Partial(jnp.matmul, jnp.tile(self.direction, self.task.horizon)[None])
@@ -217,10 +211,9 @@ class Sweep(Paged):
     def best(self) -> list[str]:
         """Return the estimate to take at each stiffness: that of least error; α-order where it gains more than a tenth."""
         errors = self.errors()
-        ranks = np.array(
-            [np.nan_to_num(x * (1.1 if name == "alpha_order" else 1), nan=np.inf) for name, x in errors.items()]
-        )
-        return [list(errors)[number] for number in ranks.argmin(axis=0)]
+        factors = {"alpha_order": 1.1}
+        ranks = [np.nan_to_num(factors.get(name, 1.0) * x, nan=np.inf) for name, x in errors.items()]
+        return [list(errors)[number] for number in np.argmin(ranks, axis=0)]
 
     @property
     def headline(self) -> str:
@@ -239,11 +232,8 @@ class Sweep(Paged):
         sure = "it has no bias"
         if taken != "zeroth":
             bias = percent(abs(table[f"{taken}_bias"] / table["truth"])[row, 0])
-            seen = (
-                f"its bias is {bias}"
-                if table[f"{taken}_is_biased"][row, 0]
-                else f"no bias was seen above {percent(reach)}"
-            )
+            is_biased = table[f"{taken}_is_biased"][row, 0]
+            seen = f"its bias is {bias}" if is_biased else f"no bias was seen above {percent(reach)}"
             tell = ", more samples would tell" if reach > 1 else ""
             sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}{tell}"
         others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
@@ -342,12 +332,10 @@ def sweep(
             left = (began[-1] - began[0]) / (done - 1) * (total - done)
             say(f"{done} of {total} parts, {duration(left)} left")
 
-    what, by = (
-        f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each",
-        engine_of(scene, task.contact),
-    )
+    what = f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each"
+    by = engine_of(scene, task.contact)
     if by is ENGINES[QUICK] and task.num_controls:
-        price = seconds_of(scene, task.horizon)
+        price = {kind: task.horizon * seconds for kind, seconds in seconds_of(scene).items()}
         one = price[getattr(task.contact, "gradient", "slope")]
         seconds = len(swept) * (num_samples * one + num_reference * price["motion"])
         what += f": {duration(seconds)}, {BATCH * one:.2g} s a gradient"
@@ -371,7 +359,6 @@ def sweep(
     if not np.isfinite(result.table()["truth"]).any():
         raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
     if result.share < 1:
-        told.append(
-            f"Interrupted after {result.share:.0%} of the rollouts, at {len(result.cost)} of {len(swept)} stiffnesses."
-        )
+        reached = f"at {len(result.cost)} of {len(swept)} stiffnesses"
+        told.append(f"Interrupted after {result.share:.0%} of the rollouts, {reached}.")
     return Sweep(scene.name, " ".join(told), knob.own, result)
