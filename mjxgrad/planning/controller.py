@@ -25,7 +25,7 @@ PARTS: tuple[str, ...] = ("linear models", "backward pass", "rollouts")
 """Of an iteration, in their order."""
 _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first plan has
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
-_FADING = 0.8  # of what a part is expected to take, if it took less
+_FADING = 0.95  # of what a part is expected to take, if it took less
 
 
 class Controller(Printed):
@@ -103,12 +103,17 @@ class Controller(Printed):
         numbers, rest = eqx.partition(self.cost, eqx.is_inexact_array_like)
         self._blank = problem.begin(self.system.origin, controls)
         of = lambda numbers: dataclasses.replace(problem, cost=eqx.combine(numbers, rest))  # noqa: E731
+        num = len(controls)
+        # Linear models take longest, and half of them at a time: a decision may end between the halves.
+        self._iteration = [(PARTS[0], begin) for begin in sorted({0, num // 2})] + [(part, 0) for part in PARTS[1:]]
         parts = (
-            lambda numbers, search, factor, *_: of(numbers).linearised(search, factor),
+            lambda numbers, search, factor, _, begin, *__: of(numbers).linearised(
+                search, factor, begin, num - num // 2
+            ),
             lambda numbers, search, *_: of(numbers).solved(search),
-            lambda numbers, search, _, *given: of(numbers).chosen(search, *given)[0],
+            lambda numbers, search, _, following, __, *given: of(numbers).chosen(search, following, *given)[0],
         )
-        given = numbers, self._blank, number, number, np.bool_(True), self._noise(0)
+        given = numbers, self._blank, number, number, np.int32(0), np.bool_(True), self._noise(0)
         lowered = [jax.jit(part).lower(*given) for part in parts]
         with ThreadPoolExecutor(len(PARTS)) as threads:
             self._programs: dict[str, Any] = dict(
@@ -118,20 +123,21 @@ class Controller(Printed):
 
     def _measure(self) -> None:
         """Measure the parts of a decision, the least of three: what a first one prepares is kept."""
-        self.price, found = {}, []
+        self.price, self._least, found = {}, dict.fromkeys(self._iteration, 0.0), []
         self.reset()
         for _ in range(3):
             self(self._origin)
             found.append(dict(self._last))
-        num = len(self._schedules[1])
-        self.price = {part: num * min(seconds[part] for seconds in found) for part in PARTS}
+        self.price = dict.fromkeys(PARTS, 0.0)
+        for step in self._iteration:
+            self.price[step[0]] += len(self._schedules[1]) * min(seconds[step] for seconds in found)
+        self._least = {step: min(seconds[step] for seconds in found) for step in self._iteration}
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan and the counts; the next decision is a first one."""
         self._search, self._next, self.num_missed, self.num_cut = self._blank, 0, 0, 0
-        self._last = {part: self.price.get(part, 0.0) / len(self._schedules[1]) for part in PARTS}
-        self._expected = dict(self._last)
+        self._last, self._expected = dict(self._least), dict(self._least)
         self.seconds: list[float] = []
 
     @property
@@ -156,15 +162,15 @@ class Controller(Printed):
         self._begin(start, is_first)
         given = self.plan.cost
         factors = self._schedules[0 if is_first else 1]
-        turns = [(*both, part) for both in itertools.pairwise([*factors, factors[-1]]) for part in PARTS][self._next :]
-        for number, (factor, following, part) in enumerate(turns):
+        turns = [(*both, step) for both in itertools.pairwise([*factors, factors[-1]]) for step in self._iteration]
+        for number, (factor, following, step) in enumerate(turns[self._next :]):
             before = time.perf_counter()
-            is_cut = number > 0 and before - began + self._expected[part] > limit
-            self._next = PARTS.index(part) if is_cut else 0
+            is_cut = number > 0 and before - began + self._expected[step] > limit
+            self._next = self._iteration.index(step) if is_cut else 0
             if is_cut:
                 self.num_cut += 1
                 break
-            self._advance(part, factor, following)
+            self._advance(step, factor, following)
         self.seconds.append(time.perf_counter() - began)
         self.num_missed += self.seconds[-1] > limit
         if is_first and self._search.unmoved.any() and self.price and not self.plan.cost < _LITTLE * given:
@@ -186,15 +192,18 @@ class Controller(Printed):
         course = Course(jax.device_put(states), search.best.controls, unknown)
         self._search = dataclasses.replace(search, course=course, best=course)
         if is_first:
-            self._advance("rollouts", *2 * [self._schedules[0][0]], is_first=True)
+            self._advance(self._iteration[-1], *2 * [self._schedules[0][0]], is_first=True)
 
-    def _advance(self, part: str, factor: np.generic, following: np.generic, *, is_first: bool = False) -> None:
-        """Run a part of an iteration; its time is what the next is expected to take."""
+    def _advance(
+        self, step: tuple[str, int], factor: np.generic, following: np.generic, *, is_first: bool = False
+    ) -> None:
+        """Run a part of an iteration, from a step of the plan on; its time is what the next is expected to take."""
         began, numbers = time.perf_counter(), eqx.filter(self.cost, eqx.is_inexact_array_like)
-        given = factor, following, np.bool_(is_first), self._noise(len(self.seconds))
+        part, begin = step
+        given = factor, following, np.int32(begin), np.bool_(is_first), self._noise(len(self.seconds))
         self._search = jax.block_until_ready(self._programs[part](numbers, self._search, *given))
-        self._last[part] = time.perf_counter() - began
-        self._expected[part] = max(self._last[part], _FADING * self._expected[part])
+        self._last[step] = time.perf_counter() - began
+        self._expected[step] = max(self._last[step], _FADING * self._expected[step])
 
     def _noise(self, seed: int) -> Float[np.ndarray, "N horizon m"]:
         """Return changes of the controls, each held for a quarter of the plan, and each plan's larger than the last one's."""

@@ -166,11 +166,15 @@ class Problem(eqx.Module):
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
-    def linearised(self, search: Search, factor: _Scalar) -> Search:
-        """Take the linear models of all steps of the course."""
+    def linearised(self, search: Search, factor: _Scalar, begin: ArrayLike = 0, count: int | None = None) -> Search:
+        """Take the linear models of all steps of the course, or of so many from one on."""
         course, linear_model = search.course, functools.partial(self.smoother.scaled(factor).linear_model, self.system)
-        models = jax.vmap(linear_model)(course.states[:-1], course.controls, self.keys)
-        return dataclasses.replace(search, models=models)
+        count = len(course.controls) if count is None else count
+        steps = [
+            jax.lax.dynamic_slice_in_dim(x, begin, count) for x in (course.states[:-1], course.controls, self.keys)
+        ]
+        put = lambda old, new: jax.lax.dynamic_update_slice_in_dim(old, new.astype(old.dtype), begin, 0)  # noqa: E731
+        return dataclasses.replace(search, models=jax.tree.map(put, search.models, jax.vmap(linear_model)(*steps)))
 
     def solved(self, search: Search) -> Search:
         """Take the feedback law of the linear-quadratic problem, and the unmoved coordinates."""

@@ -63,8 +63,8 @@ def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):
 
 
 @pytest.mark.parametrize("error", ["double"], indirect=True)
-def test_an_iteration_asks_c_mujoco_twice(monkeypatch, system):
-    """Once for all linear models, and once for all step lengths; a call for each step would be seen."""
+def test_an_iteration_asks_c_mujoco_three_times(monkeypatch, system):
+    """Once for each half of the linear models, and once for all step lengths; a call for each step would be seen."""
     counts = collections.Counter()
     for name in ("steer", "product", "follow"):
         monkeypatch.setattr(Pool, name, _counted(counts, name))
@@ -72,7 +72,7 @@ def test_an_iteration_asks_c_mujoco_twice(monkeypatch, system):
     controller(state)
     counts.clear()
     controller(state)
-    assert counts == {"steer": 2, "product": 2}
+    assert counts == {"steer": 2, "product": 4}
 
 
 def _counted(counts, name):

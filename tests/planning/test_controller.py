@@ -64,11 +64,11 @@ def test_a_first_decision_is_the_plan_of_its_schedule(controller):
 
 
 def test_without_time_a_decision_is_a_part_of_an_iteration_and_counts_as_missed(controller, monkeypatch):
-    """The first one has no deadline: the course of the given controls, and five iterations of three parts."""
+    """The first one has no deadline: the course of the given controls, and five iterations of four steps."""
     taken = []
     count = lambda one: lambda *given: taken.append(given) or one(*given)  # noqa: E731
     monkeypatch.setattr(controller, "_programs", {name: count(one) for name, one in controller._programs.items()})
-    for num_missed, num_taken in ((0, 16), (1, 17), (2, 18)):
+    for num_missed, num_taken in ((0, 21), (1, 22), (2, 23)):
         assert np.isfinite(controller(START)).all()
         assert (controller.num_missed, len(taken)) == (num_missed, num_taken)
     assert ", 2 missed 1e-6 ms, 2 cut short. A decision takes about" in str(controller)

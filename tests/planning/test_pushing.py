@@ -74,7 +74,7 @@ def test_where_nothing_is_touched_a_warning_says_what_to_do(controller, system):
 
 @pytest.mark.filterwarnings("ignore:no control moves")
 def test_a_deadline_is_kept_where_an_iteration_takes_longer(controller, system, monkeypatch):
-    """Parts of 100 ms and a deadline of 280: two are done in a decision, the third in the next, and the plan improves."""
+    """Steps of 100 ms and a deadline of 280: two of four are done in a decision, the rest in the next, and the plan improves."""
     now = [0.0]
 
     def slow(program):
