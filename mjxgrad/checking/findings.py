@@ -194,7 +194,8 @@ def slope_finding(found: Sequence[Slope]) -> Finding:
     if not (count := slope.errors.size):
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
     far, errors = _is_far(found), [percent(one.error) for one in found]
-    lead = f"Expected error beside the slope of the outcome, over {count} readings by {slope.num_motions} motions each"
+    readings = f"{count} reading{'s' * (count > 1)} by {slope.num_motions} motions each"
+    lead = f"Expected error beside the slope of the outcome, over {readings}"
     both = f"{chosen('slope')} {errors[0]}, {chosen('discrete')} {errors[1]}"
     nearer, alike = (slope.errors < discrete.errors).sum(), (slope.errors == discrete.errors).sum()
     text = f"{lead}: {both}. The slope is nearer in {nearer}" + f" and as near in {alike}" * bool(alike)
@@ -321,7 +322,7 @@ def headline(
     sure = "an unmeasured choice"
     for one in found:
         if one.kind == advice.gradient and one.errors.size:
-            sure = f"{percent(one.error)} off by {one.errors.size} readings"
+            sure = f"{percent(one.error)} off by {one.errors.size} reading{'s' * (one.errors.size > 1)}"
     if not (motions.touches or motions.touching):
         sure = "without contact, exact"
     cost = f"; {prices[advice.gradient]:.2g} s a gradient" if prices else ""
