@@ -5,7 +5,6 @@ from pathlib import Path
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad.contact import Softness
@@ -52,10 +51,6 @@ class ActionTask(SceneTask):
         if self.policy is None:
             return open_loop(task, stddev)
         return closed_loop(task, self.policy, stddev, params=self.start_params)
-
-    def initial_params(self) -> Float[Array, " dim"]:
-        """Return the start of the optimisation as the flat vector that estimators take."""
-        return ravel_pytree(self.start_params)[0]
 
 
 class BallWall(InScene):

@@ -226,7 +226,8 @@ class Environment(InScene):
         fresh = jax.lax.stop_gradient(self.reset(fresh_key))
         # A state from another environment may have other pairs, or none.
         if jax.tree.structure(fresh) != jax.tree.structure(stepped):
-            fresh = eqx.tree_at(_pairs, fresh, _pairs(stepped), is_leaf=lambda x: x is None)
+            physics = dataclasses.replace(fresh.physics, pairs=stepped.physics.pairs)
+            fresh = dataclasses.replace(fresh, physics=physics)
         following = jax.tree.map(lambda new, old: jnp.where(stepped.done, new, old), fresh, stepped)
         return stepped, dataclasses.replace(following, key=key)
 
@@ -252,7 +253,3 @@ class Environment(InScene):
         """Return the key of one copy, for `randomised`, and the start of its first episode."""
         copy_key, reset_key = jax.random.split(key)
         return copy_key, self.randomised(copy_key).reset(reset_key)
-
-
-def _pairs(state: EnvState) -> PyTree:
-    return state.physics.pairs

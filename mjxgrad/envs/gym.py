@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from mjxgrad.envs import ENVIRONMENTS, load
 from mjxgrad.envs.environment import Environment, EnvState
@@ -99,11 +99,8 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-
-        def advance(key: PRNGKeyArray, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
-            return self.environment.randomised(key).step_on(state, action)
-
         self._begin = jax.jit(lambda key: jax.vmap(self.environment.begin)(jax.random.split(key, num_envs)))
+        advance = lambda key, state, action: self.environment.randomised(key).step_on(state, action)  # noqa: E731
         self._advance = jax.jit(jax.vmap(advance))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Info]:
