@@ -6,18 +6,15 @@ the time of impact. Here the step keeps its length, and takes the mean accelerat
 
     a = ∫₀¹ a(contacts with φ > s) ds,        φ = clip(1/2 - r / w, 0, 1),        w = h |v|.
 
-φ is the share of the step after the time of impact, with r the distance less the margin, v its rate and h the time step; a(·)
-is MuJoCo's acceleration with exactly these contacts, all at the present state. A contact that begins alone gives
-(1 - φ) a₋ + φ a₊. Its impulse is linear in φ in all directions, friction included, whatever else the bodies touch. (The same
-share on the impedance would not be: rows resist with the inertia behind them, which differs between normal and tangent.)
+φ is the share of the step after the time of impact, with r the distance less the margin, v its rate and h the time step; a(·) is
+MuJoCo's acceleration with exactly these contacts, all at the present state. A contact that begins alone gives (1 - φ) a₋ + φ a₊,
+linear in φ in all directions, friction included. (The same share on the impedance would not be: rows resist with the inertia
+behind them, which differs between normal and tangent.)
 
-**Consequences.** The solve is strictly convex and its weights are continuous in φ. So the whole step is a continuous function of
-state and parameters, for contacts, joint and tendon limits, all cones, at onset and at release. Hence:
-
-1. The mean of the plain derivative over any interval is the difference of the outcome. No saltation term is needed, and no
-   assumption on order, speed or duration of contacts.
-2. The ramp is centred at r = 0, where MuJoCo switches, so over the phase of a step the mean motion is MuJoCo's, and only the
-   sawtooth is lost. φ = 1 is MuJoCo's contact, that of bodies that rest, slide or stick deeper than w / 2; φ = 0 is none.
+**Consequences.** The whole step is a continuous function of state and parameters, for contacts, joint and tendon limits, all
+cones, at onset and at release. So the mean of the plain derivative over any interval is the difference of the outcome. The ramp
+is centred at r = 0, where MuJoCo switches, so over the phase of a step the mean motion is MuJoCo's. φ = 1 is MuJoCo's
+contact, that of bodies that rest, slide or stick deeper than w / 2; φ = 0 is none.
 
 **Several at once.** The integral needs one solve for each of its pieces. Two are taken for any number of partial contacts,
 
@@ -29,26 +26,24 @@ partial, or all have the same φ, this is the integral. Otherwise a contact with
 **Slow contacts.** The derivative by r is 1 / w, so where contacts graze or chatter w has a floor, w ≥ √(h²u² + w₀²):
 
 - Grazing: u = max(g h, g / 2(B + √K)). Below u free motion, or the weight on the contact, moves the bodies faster than they
-  approach. The edges n ± μ t of a sliding pyramid act with B μ |v_t| on touch, often many times the weight, so u grows by three
-  times the speed that this force gains in a step, unless the approach is much faster than 2 g h: an impact.
-- Motors: a light foot pressed down with many times its weight is stopped and released within a few steps, and each time its
-  tangent grows by about h Δa / u. So u gets such a term for three times |J a| - g, with a the unconstrained acceleration. It adds
-  at most 10 of the impedance's widths to w, and is zero for bodies that only fall or roll.
-- Chatter: w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Where contacts chatter (a body pushed along the
-  floor) each switch multiplies the tangent by about h Δa / w, which w₀ bounds. A larger w₀ gives a smoother motion, farther
-  from MuJoCo's. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, are not widened by it.
+  approach. The edges n ± μ t of a sliding pyramid act with B μ |v_t| on touch, so u grows by three times the speed that this
+  force gains in a step, unless the approach is much faster than 2 g h: an impact.
+- Motors: a light foot pressed down with many times its weight is stopped and released within a few steps. So u gets such a term
+  for three times |J a| - g, with a the unconstrained acceleration. It adds at most 10 of the impedance's widths to w.
+- Chatter: w₀ is `Onset.width` times the impedance's width, 0.1 mm by default. Each switch of a contact that chatters multiplies
+  the tangent by about h Δa / w, which w₀ bounds. Impacts, much faster than 6 √(g w₀), 19 cm/s by default, are not widened by it.
 
 Where w has its floor, r is taken ahead, r + h v (1 - h²v²/w²), which damps oscillations on the ramp.
 
 **Change of sides.** The normal flips where two centres pass each other along it (a ball driven through a thin wall). It turns by
-a right angle where another face of a box becomes the nearest to a ball's centre within the box. The present side then acts for
-ψ = min(1, 1/2 + δ / w) of the step, the other side for the rest. Here δ is how much nearer the present side is, and w is how
-much δ changes in a step. This covers geoms with a centre of symmetry, and balls in boxes.
+a right angle where another face of a box becomes the nearest to a ball's centre within the box. The present side then acts for ψ
+= min(1, 1/2 + δ / w) of the step, the other side for the rest. Here δ is how much nearer the present side is, and w is how much δ
+changes in a step. This covers geoms with a centre of symmetry, and balls in boxes.
 
 **Limits.** True discontinuities remain: hit or miss, an edge that catches, boxes that change their touching faces, three faces of
-a box equally near. A contact shorter than about three steps is smooth but not resolved. Chatter multiplies tangents, within the
-bound of the width. The distance of boxes and meshes is known only where they overlap, except from planes, and between boxes and
-balls. Without a distance the ramp lies at 0 > r > -w: continuous, but half a step late.
+a box equally near. A contact shorter than about three steps is smooth but not resolved. The distance of boxes and meshes is known
+only where they overlap, except from planes, and between boxes and balls. Without a distance the ramp lies at 0 > r > -w:
+continuous, but half a step late.
 
 References:
     Suh, Simchowitz, Zhang, Tedrake. Do Differentiable Simulators Give Better Policy Gradients? ICML 2022, arXiv:2202.00817.
@@ -83,15 +78,12 @@ _Split = tuple[tuple[_PerRow, _PerRow], Float[Array, ""], Bool[Array, ""], tuple
 _LEAST_SHARE = 1e-9
 # Factor on a pyramid's slip in the width. Derivatives of a box pushed along the floor at 4 ms are 10⁷ with 1, 1 to 4 with 2 or 3.
 _SLIP = 3.0
-# Factor on the acceleration by motors in the width, and its bound in widths of the impedance. With less of either, feet of MuJoCo
-# Playground's robots chatter; without a bound, a strong servo holds a light link off the floor.
+# Factor on the acceleration by motors in the width, and its bound in widths of the impedance: feet of robots chatter with less.
 _PRESS, _WIDEST = 3.0, 10.0
-# Width of an impedance (m) beyond any contact, and the width used in its place.
-_ENDLESS, _USUAL_WIDTH = 1e3, 1e-3
+_ENDLESS, _USUAL_WIDTH = 1e3, 1e-3  # width of an impedance (m) beyond any contact, and the width used in its place
 # Ratio to the slow speed beyond which a contact is an impact; fourth powers beyond it are too large for single precision.
 _IMPACT = 1e3
-# Gravity (m/s²) that separates impacts from chatter in scenes without gravity.
-_GRAVITY = 9.81
+_GRAVITY = 9.81  # gravity (m/s²) that separates impacts from chatter in scenes without gravity
 
 
 class Onset(eqx.Module):
@@ -113,10 +105,8 @@ class Onset(eqx.Module):
 
 
 def reach(model: mjx.Model, data: mjx.Data, onset: Onset) -> Float[Array, ""]:
-    """Return the distance less the margin beyond which no contact acts in the coming step (m).
-
-    It assumes that no contact is stiffer or slower than those of the data, and that geoms lie within their bounding spheres.
-    """
+    """Return the distance less the margin beyond which no contact acts in the coming step (m)."""
+    # It assumes that no contact is stiffer or slower than those of the data, and that geoms lie within their bounding spheres.
     contact, h = data._impl.contact, model.opt.timestep
     speed = _largest_rate(model, data, data.cvel)
     free = _largest_rate(model, data, com_vel(model, data.replace(qvel=data.qacc_smooth)).cvel)
@@ -216,28 +206,23 @@ def _share(model: mjx.Model, data: mjx.Data, block: Block, onset: Onset) -> tupl
     rates = block.map.mv(data.qvel).reshape(-1, block.rows_each)
     rate, distance = _normal(block, rates), block.residual[:: block.rows_each]
     travel = model.opt.timestep * jnp.abs(rate)
-    least = _least_width(model, data, block, onset, rates, rate)
+    least = _least_width(model, data, block, onset, rates)
     width = jnp.where(travel > least, travel, least)
     slow = 1 - (travel / jnp.where(width > 0, width, 1.0)) ** 2
     distance = distance + model.opt.timestep * rate * slow
     if block.slots is None:
         return _ramp(distance, width, 0.5), None
-    slots, contacts = slot_geoms(model, data), slice(*block.slots)
-    geoms = (data._impl.contact.geom if slots is None else slots)[contacts]
+    slots = slot_geoms(model, data)
+    geoms = (data._impl.contact.geom if slots is None else slots)[slice(*block.slots)]
     share = _ramp(distance, width, jnp.where(is_blind(model, geoms), 0.0, 0.5))
-    return share, _side(model, data, block, contacts, geoms, rate, least)
+    return share, _side(model, data, block, geoms, rate, least)
 
 
 def _least_width(
-    model: mjx.Model,
-    data: mjx.Data,
-    block: Block,
-    onset: Onset,
-    rates: Float[Array, "contacts each"],
-    rate: _PerContact,
+    model: mjx.Model, data: mjx.Data, block: Block, onset: Onset, rates: Float[Array, "contacts each"]
 ) -> _PerContact:
     """Return the floor √(h²u² + w₀²) of an onset's ramp, for contacts that graze or chatter."""
-    each, h = block.rows_each, model.opt.timestep
+    each, h, rate = block.rows_each, model.opt.timestep, _normal(block, rates)
     stiffness, damping = (x[::each] for x in stiffness_damping(model, block.solref, block.impedance.full))
     gravity = safe_sqrt(jnp.sum(model.opt.gravity**2))
     press = jnp.abs(_normal(block, block.map.mv(data.qacc_smooth).reshape(-1, each))) - gravity
@@ -254,7 +239,6 @@ def _least_width(
 
 
 def _normal(block: Block, rates: Float[Array, "contacts each"]) -> _PerContact:
-    """Return the rates along the normal."""
     return jnp.mean(rates, axis=1) if block.is_pyramid else rates[:, 0]
 
 
@@ -275,22 +259,18 @@ def _ramp(distance: _PerContact, width: _PerContact, centre: Float[Array, "..."]
 
 
 def _side(
-    model: mjx.Model,
-    data: mjx.Data,
-    block: Block,
-    contacts: slice,
-    geoms: Array | np.ndarray,
-    rate: _PerContact,
-    least: _PerContact,
+    model: mjx.Model, data: mjx.Data, block: Block, geoms: Array | np.ndarray, rate: _PerContact, least: _PerContact
 ) -> _Side | None:
     """Return the share ψ of each contact's present side, and the rows of its other side; None if no contact has one."""
     can_turn = ~are(model, geoms, WITHOUT_CENTRE).any(axis=1)
     if isinstance(can_turn, np.ndarray) and not can_turn.any():
         return None
-    contact = jax.tree.map(lambda x: x[contacts], data._impl.contact)
+    assert block.slots is not None
+    own = slice(*block.slots)
+    contact = jax.tree.map(lambda x: x[own], data._impl.contact)
     others, nearer = other_sides(model, data, contact, geoms)
     dim = block.rows_each // 2 + 1 if block.is_pyramid else block.rows_each
-    turned = row_map(model, data, others, contacts.start, dim)
+    turned = row_map(model, data, others, own.start, dim)
     turning = model.opt.timestep * jnp.abs(rate - _normal(block, turned.mv(data.qvel).reshape(-1, block.rows_each)))
     width = jnp.where(turning > 2 * least, turning, 2 * least)
     share = 0.5 + nearer / jnp.where(width > 0, width, 1.0)
@@ -298,10 +278,8 @@ def _side(
 
 
 def _split(blocks: list[Block], shares: list[Float[Array, " _"]], sides: list[_Side | None]) -> _Split:
-    """Return p₊ and p₋, Φ, whether p₋ and p₊ differ, and J of the solve with p₋ by block, from φ of the rows.
-
-    J is None where it is that of the other solve; it differs where contacts act from another side.
-    """
+    """Return p₊ and p₋, Φ, whether p₋ and p₊ differ, and J of the solve with p₋ by block, from φ of the rows."""
+    # J is None where it is that of the other solve; it differs where contacts act from another side.
     # The first row of a contact or limit represents it in the mean.
     numbered = [(np.arange(len(block.residual)), block.rows_each) for block in blocks]
     is_first = np.concatenate([row % num == 0 if num else np.zeros(len(row), bool) for row, num in numbered])
