@@ -223,17 +223,14 @@ def compile_once(lowered: jax.stages.Lowered, options: dict | None = None) -> ja
 
     The text contains all constants, but not the bodies of callbacks.
     """
-    text = lowered.as_text()
-    if "callback" in text:
-        return patiently(lambda: lowered.compile(compiler_options=options))
-    shapes = str(jax.tree.leaves(lowered.args_info))
+    text, shapes = lowered.as_text(), str(jax.tree.leaves(lowered.args_info))
     key = (hashlib.sha256(text.encode()).digest(), lowered.in_tree, lowered.out_tree, shapes)
-    if key not in _KEPT:
-        _KEPT[key] = patiently(lambda: lowered.compile(compiler_options=options))
-    _KEPT.move_to_end(key)
-    if len(_KEPT) > _MOST_KEPT:
-        _KEPT.popitem(last=False)
-    return _KEPT[key]
+    program = _KEPT.pop(key, None) or patiently(lambda: lowered.compile(compiler_options=options))
+    if "callback" not in text:
+        _KEPT[key] = program  # the latest
+        if len(_KEPT) > _MOST_KEPT:
+            _KEPT.popitem(last=False)
+    return program
 
 
 def keep_compiled() -> Path | None:
