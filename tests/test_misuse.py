@@ -217,7 +217,7 @@ FOUND = {
     "mg.linear_policy(4, 1, observe=3)": "observe must be a function of state, got int",
     "mg.parameter_noise(jnp.sum, 0.1, dim=2.0)": "dim must be a whole number, got 2.0",
     "mg.parameter_noise(jnp.sum, jnp.inf)": "stddev must be positive and finite, got inf",
-    "mg.load_scene('<mujoco/>', engine='brax')": "engine must be one of 'mjx', 'mujoco', None, got 'brax'",
+    "mg.load_scene('<mujoco/>', engine='brax')": "engine must be one of 'mjx', 'mujoco', 'warp', None, got 'brax'",
     "mg.load_scene('<mujoco/>', keep_everything='no')": "keep_everything must be True or False, got str",
     "optimise(estimator=None)": "estimator must be a function of objective and params and key, got NoneType",
     "optimise(evaluate=lambda x: x)": "evaluate must return a scalar of shape (), got shape (2,)",

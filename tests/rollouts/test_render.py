@@ -105,11 +105,6 @@ def test_tiles_stand_in_rows_and_the_shorter_video_keeps_its_last_frame():
     assert (tiled[:, band + 20 :, 40:] == 0).all()
 
 
-def test_a_caption_too_few_is_refused():
-    with pytest.raises(ValueError, match="captions must be as many as videos"):
-        tile([np.zeros((1, 8, 8, 3), np.uint8)] * 2, ["one"], columns=2)
-
-
 def test_a_video_is_complete_or_absent(tmp_path):
     video = np.random.default_rng(0).integers(0, 255, (5, 33, 48, 3), dtype=np.uint8)
     write_video(tmp_path / "video.mp4", video, fps=10)
