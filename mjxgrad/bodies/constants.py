@@ -1,7 +1,7 @@
 """Constants that MuJoCo's compiler derives from masses, inertias, lengths and sizes, computed again from the present values.
 
-The regularisation of constraint rows is scaled by inverse weights at the reference pose. Without them a derivative by a mass
-would miss that part of the model. MuJoCo computes them in `mj_setConst`, and the bounding radii in its compiler.
+Inverse weights at the reference pose scale constraint rows: without them a derivative by a mass would miss that part of the
+model.
 """
 
 import jax

@@ -1,8 +1,4 @@
-"""Actuation, passive and applied forces of common models.
-
-Drop-ins for MJX's stages. They compute actuators without dynamics on hinges and slides, joint springs and dampers. Each
-function says what it leaves to MJX.
-"""
+"""Actuation, passive and applied forces of common models: drop-ins for MJX's stages, which say what they leave to MJX."""
 
 import jax.numpy as jnp
 import mujoco

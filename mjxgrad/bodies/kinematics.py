@@ -204,7 +204,7 @@ class Inertia(eqx.Module):
     moves: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())  # of `tree.moving_dofs`
 
     def apply(self, acceleration: _Vector) -> _Vector:
-        if self.bodies is None or self.axes is None:
+        if self.bodies is None or self.axes is None or self.armature is None:
             return contract("ij,j->i", self.matrix, acceleration)
         moves = np.array(self.moves)
         motion = combine(moves, maps.scale(acceleration, self.axes))

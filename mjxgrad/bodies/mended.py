@@ -1,13 +1,12 @@
 """Copies of MJX's functions with finite derivatives; MJX itself is not changed.
 
-Guards that keep a value finite do not always keep its derivative finite: that of a quotient divides by its square, which
-overflows in single precision. This module copies the modules that hold such guards, replaces a few functions, and lets the copies
-call each other. Values are MJX's to the bit, except where a guard acts and where the list says otherwise:
+Guards that keep a value finite do not always keep its derivative finite: that of a quotient divides by its square. This module
+copies the modules that hold such guards, replaces a few functions, and lets the copies call each other. Values are MJX's to the
+bit, except where a guard acts and where the list says otherwise:
 
 - `collision_convex`, in `contact.collision`: two quotients, where an edge meets a plane and where a face meets another.
 - `support.muscle_dynamics_timescale`: the smooth switch, a quintic in a quotient by a width that is zero by default.
-- `support.wrap`: tendons on spheres and cylinders, with the values of C MuJoCo. MJX has NaN derivatives where a tendon's end lies
-  on the axis, and on short arcs. Inside a ring it takes five steps of a search that needs up to twenty.
+- `support.wrap`: tendons on spheres and cylinders, with the values of C MuJoCo, also inside rings, where MJX's search is short.
 - `math.quat_to_axis_angle`: separate axis and angle have no derivative at rest. Rounding differs.
 - `math.safe_div`, `ray._ray_quad`: the distance along rays that run along a face, or miss a ball, had no derivative.
 - `ray.ray`: it fails in a scene without materials.

@@ -56,22 +56,27 @@ class Engine(Protocol):
 
     def complete(self, scene: Scene, state: State, contact: Contact) -> State:
         """Return a state with all that this engine goes on with from one rollout to the next."""
+        ...
 
     def roll_out(self, motion: Motion, state: State, rows: Rows) -> Trajectory:
         """Return the result of `rollout`, for checked arguments."""
+        ...
 
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
     ) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C and D of one step, see `rollouts.Linearisation`."""
+        ...
 
     def hold(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], num_steps: int, contact: Contact) -> State:
         """Return the state after a control was held for some steps; differentiable."""
+        ...
 
     def look(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
     ) -> PyTree:
         """Return what a function of model and data sees in a state under a control and other inputs; differentiable."""
+        ...
 
 
 def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:

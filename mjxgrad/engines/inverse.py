@@ -13,8 +13,7 @@ and no difference contains an iteration of a solver: nothing that its tolerance 
 - **Actuators.** Each force depends on the actuator's own length, velocity, control and activations, so all are changed at once,
   and the moment arms carry the result. Where the integrator's matrix depends on controls (muscles, gains by velocity), where
   joints or tendons limit forces, or actuators are coupled, each is changed alone, and R is taken anew.
-- **What has no R**: Runge-Kutta, noslip, delays, plugins, and steps whose residual is not zero. `engines.jacobians` then takes
-  whole steps.
+- **Without R** (Runge-Kutta, noslip, delays, plugins, steps whose residual is not zero) `engines.jacobians` takes whole steps.
 
 `mjd_transitionFD` keeps the integrator's factorisation while it changes what that depends on: muscles and dampers are off by up
 to a quarter there.

@@ -278,7 +278,7 @@ class Pool:
         # MuJoCo's own differences are taken where they are right, see `Worker.differences`: they are five times faster.
         batch, *given = self._flat(np.ndim(start["time"]) - 1, numbers, start, inputs)
         (num, steps), size, nu = given[2]["ctrl"].shape[:2], self.layout.num_changes, self.mj_model.nu
-        found = {"state": np.zeros((num, size, size)), "ctrl": np.zeros((num, size, nu))}
+        found: dict[str, np.ndarray] = {"state": np.zeros((num, size, size)), "ctrl": np.zeros((num, size, nu))}
         found["end"], is_right = np.zeros((num, len(self.layout.motion))), np.zeros(num, bool)
         if gradient == "discrete":
             with self.lock, collected():
@@ -324,8 +324,8 @@ class Pool:
         together = max(1, int(_MOST_NUMBERS / (steps * size * (2 * size + NUM_SLOTS))))
         for first in range(0, num, together):
             motions = range(num)[first : first + together]
-            given = (_part(slice(first, first + together), num, one) for one in (numbers, before, inputs))
-            found = self.maps(*given, self.no_flight((len(motions),)), gradient=gradient, wanted=names)
+            cut, flight = functools.partial(_part, slice(first, first + together), num), self.no_flight((len(motions),))
+            found = self.maps(cut(numbers), cut(before), cut(inputs), flight, gradient=gradient, wanted=names)
             for k, motion in enumerate(motions):
                 main, course = changes[motion], []
                 held = np.zeros((NUM_SLOTS, *main.shape[1:]))

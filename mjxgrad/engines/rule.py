@@ -172,7 +172,7 @@ def _without_zeros(tangents: Mapping[str, Any]) -> dict[str, Array]:
 
 
 def _dense(tangent: Any) -> Array:
-    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent
+    return jnp.zeros(tangent.shape, tangent.dtype) if isinstance(tangent, SymbolicZero) else tangent  # pyright: ignore[reportArgumentType]
 
 
 def _added(change: Array, by: _Arrays, given: _Arrays, inputs: Mapping[str, Any]) -> Array:

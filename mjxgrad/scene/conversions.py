@@ -1,7 +1,6 @@
 """Settings that MJX rejects or ignores, replaced by equivalent ones; and parts of a step that a motion does not need.
 
-Each rule changes a copy of the C model in place and returns its change. Where the motion cannot be
-kept exactly the conversion says so, and loading the scene warns.
+Each rule changes a copy of the C model in place and returns its change, which says where the motion is not kept exactly.
 """
 
 import copy

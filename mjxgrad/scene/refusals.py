@@ -1,8 +1,4 @@
-"""Features that MJX cannot simulate, each with its remedy.
-
-The table comes from a small scene per feature, stepped in C MuJoCo and in MJX 3.17. Some features
-raise in MJX without naming the element, and many more are ignored.
-"""
+"""Features that MJX cannot simulate, each with its remedy: of a small scene per feature, stepped in C MuJoCo and in MJX 3.17."""
 
 import copy
 from collections.abc import Callable, Iterable, Iterator

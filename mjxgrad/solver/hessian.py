@@ -1,8 +1,7 @@
 r"""Linear solves of Newton's method, (M + Jᵀ s'' J) x = v, from the entries of J without those that are always zero.
 
-A contact acts only on the joints between its two bodies, which are known before compilation. Arrays may carry the batch as
-trailing axes, see `linear`. A CPU assembles the matrix and factors it, each operation along the batch. A GPU would move the
-matrices of many states to memory and back many times, so it uses a single kernel.
+Arrays may carry the batch as trailing axes, see `linear`. A CPU assembles the matrix and factors it, each operation along the
+batch. A GPU would move the matrices of many states to memory and back many times, so it uses a single kernel.
 """
 
 import functools
@@ -95,7 +94,8 @@ class SparseRows(eqx.Module):
         chosen = [one for one in zip(self.groups, pieces, strict=True) if not one[0].is_diagonal]
         if not chosen:
             return jnp.zeros((0, self.num_dofs, *pieces[0][0].shape[3:]), pieces[0][0].dtype)
-        return dense(*zip(*chosen, strict=True), self.num_dofs)
+        groups, pieces = zip(*chosen, strict=True)
+        return dense(groups, pieces, self.num_dofs)
 
     def split(self, x: Float[Array, "rows *batch"]) -> tuple[Array, ...]:
         """Return the values of the rows in `dense_rows`, then those of each other group by joint velocity."""

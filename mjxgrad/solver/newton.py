@@ -121,15 +121,12 @@ class Problem(eqx.Module):
         return linear.matvec(self.mass, acceleration)
 
     def mv(self, acceleration: _Vector) -> _OfRows:
-        """Return J a."""
         return self.jacobian.matvec(acceleration)
 
     def rmv(self, force: _OfRows) -> _Vector:
-        """Return Jᵀ f."""
         return self.jacobian.rmatvec(force)
 
     def row_force(self, x: _OfRows) -> _OfRows:
-        """Return the forces of the rows."""
         return constraint.force(self.layout, self.rows, x)
 
     def hessian_product(self, x: _OfRows, along: _OfRows) -> _OfRows:

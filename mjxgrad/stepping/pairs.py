@@ -136,7 +136,8 @@ class _Program:
 
     def __init__(self, model: mjx.Model, data: mjx.Data):
         is_unknown = jax.tree.map(lambda x: isinstance(x, jax.core.Tracer), (model, data))
-        self.given, self.known = eqx.partition((model, data), _put_in(is_unknown, Motion(True, True, True)))
+        is_given = _put_in(is_unknown, Motion(True, True, True))  # pyright: ignore[reportArgumentType]
+        self.given, self.known = eqx.partition((model, data), is_given)
         self.step = jax.jit(lambda given: advance(*self.all_of(given), Discrete()))
         self.rows = jax.jit(lambda given: rows_of(*_smoothed(*self.all_of(given))))
 
@@ -195,7 +196,7 @@ class _Step:
         program, flight, now = self.program, self.flight, taken(self.given[1])
         # Leaves, beside the motion, that have a tangent.
         others = jax.tree.map(lambda x: not isinstance(x, SymbolicZero), tangents)
-        others = _put_in(others, Motion(False, False, False))
+        others = _put_in(others, Motion(False, False, False))  # pyright: ignore[reportArgumentType]
         (values, fixed), rates = eqx.partition(self.given, others), eqx.filter(tangents, others)
 
         def moved_by(change: _Change, values: _Given) -> tuple[mjx.Data, mjx.Data]:
