@@ -232,7 +232,7 @@ FOUND = {
     "mg.learning.Settings(has_critic='no')": "has_critic must be True or False, got str",
     "mg.learning.evaluate(cart, None, key, num_episodes=2)": "policy must be a function of obs, got NoneType",
     "mg.learning.evaluate('ant', len, key, num_episodes=2)": "environment must be of mg.envs.Environment, got str",
-    "mg.learning.evaluate(cart, len, key, num_episodes=2, engine='bullet')": "engine must be one of 'mjx', 'mujoco', 'warp', got 'bullet'",
+    "mg.learning.evaluate(cart, len, key, num_episodes=2, engine='bullet')": "engine must be one of 'mjx', 'mujoco', 'warp', got",
     "mg.learning.Policy.load(archive)": "path must be of a policy that save wrote, got",
     "cart.step(state, jnp.zeros(1))": "state must be of reset or step, got State",
     "Rewarded(scene, terms={'a': 'b'}).reset(key)": "'a' in rewards of Rewarded must return one number, got str",

@@ -150,7 +150,7 @@ class Worlds:
         single = {k: x.astype(jnp.float32) for k, x in given.items()}
 
         def one(given: _Values) -> mjx.Data:
-            numbers = {k.removeprefix(_NUMBER): x for k, x in given.items() if k.startswith(_NUMBER)}
+            numbers: Any = {k.removeprefix(_NUMBER): x for k, x in given.items() if k.startswith(_NUMBER)}
             state = {k: x for k, x in given.items() if k in _GIVEN}
             return mjx.step(self._model.tree_replace(numbers) if numbers else self._model, data.replace(**state))
 
@@ -169,7 +169,7 @@ class Worlds:
     def _step(self, given: _Values) -> _Values:
         return {k: x[0] for k, x in self._run({k: x[None] for k, x in given.items()}).items()}
 
-    def _derived(self, primals: tuple, tangents: tuple) -> tuple[_Values, _Values]:
+    def _derived(self, primals: tuple, tangents: tuple) -> tuple[_Values, dict[str, Any]]:
         (given,), (changes,) = primals, tangents
         found = self.step(given)
         names = tuple(k for k, x in given.items() if x.size and not isinstance(changes[k], SymbolicZero))

@@ -22,7 +22,9 @@ def _last(x):
     return jnp.moveaxis(jnp.asarray(x), 0, -1)
 
 
-@pytest.mark.parametrize(("size", "num_rows"), [(1, 0), (5, 3), (16, 40), (17, 3), (32, 9), (35, 9)])  # one block, two, and four
+@pytest.mark.parametrize(
+    ("size", "num_rows"), [(1, 0), (5, 3), (16, 40), (17, 3), (32, 9), (35, 9)]
+)  # one block, two, and four
 def test_solves_what_rows_add_up_to(size, num_rows):
     random = np.random.default_rng(size)
     roots, vector = random.normal(size=(_BATCH, size, size)), random.normal(size=(_BATCH, size))

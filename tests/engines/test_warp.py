@@ -86,7 +86,7 @@ def test_every_motion_of_a_batch_may_have_its_own_numbers():
     found = jax.vmap(lambda mass: end(scene, mass))(masses)
     expected = [end(scene.with_engine("mujoco"), mass) for mass in masses]
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    with pytest.raises(NotImplementedError, match="no derivative by actuator_acc0, .*body_mass.*: take"):
+    with pytest.raises(NotImplementedError, match=r"no derivative by actuator_acc0, .*body_mass.*: take"):
         jax.grad(lambda mass: end(scene, mass)[0])(1.0)
 
 
