@@ -119,7 +119,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     given = zip(keys, [*by_samples, *by_stiffness], strict=True)
     parts = {f"{i}": functools.partial(cell, key, *one) for i, (key, one) in enumerate(given)}
     found = workspace.each("estimates", "settings", parts)
-    swept = (found[: len(by_samples)], found[len(by_samples) :])
+    swept: list[list[xr.Dataset]] = [found[: len(by_samples)], found[len(by_samples) :]]
     over_samples, *over_stiffness = (xr.concat(one, "setting", coords=["stiffness"]) for one in swept if one)
     gradient = float(problem.gradient(settings.point, settings.stddev))
     return Outcome(settings, gradient, over_samples, next(iter(over_stiffness), None), problem)
