@@ -151,9 +151,9 @@ def _explained(model: "Regression", noise: float, room: Box, dim: int, most: flo
     for chatter in _CHATTER:  # its tails are longer than the normal's
         factors = model.weighed(noise, chatter)
         step = solved(factors, dim, room)
-        if step.squares < most:
-            break
-    return factors, chatter, step
+        if step.squares < most or chatter == _CHATTER[-1]:
+            return factors, chatter, step
+    raise AssertionError("there is a last one")
 
 
 def _tried(
