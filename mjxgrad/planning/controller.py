@@ -113,7 +113,8 @@ class Controller(Printed):
             lambda numbers, search, *_: of(numbers).solved(search),
             lambda numbers, search, _, following, __, *given: of(numbers).chosen(search, following, *given)[0],
         )
-        given = numbers, self._blank, number, number, np.int32(0), np.bool_(True), self._noise(0)
+        self._still = np.zeros_like(self._noise(0))
+        given = numbers, self._blank, number, number, np.int32(0), np.bool_(True), self._still
         lowered = [jax.jit(part).lower(*given) for part in parts]
         with ThreadPoolExecutor(len(PARTS)) as threads:
             self._programs: dict[str, Any] = dict(
@@ -179,13 +180,17 @@ class Controller(Printed):
 
     def _begin(self, start: np.ndarray, is_first: bool) -> None:
         """Shift all by a step, to the present state; the first time compute the course of the given controls."""
-        # By NumPy: JAX would compile programs. The new course of the shifted plan is not computed: the feedback law around the
-        # old one takes the difference.
-        later = lambda x: jax.device_put(np.concatenate([x[1:], x[-1:]])) if np.ndim(x) else x  # noqa: E731
+
+        # By NumPy: JAX would compile programs, and takes a tenth of a millisecond for a slice. The new course of the shifted plan
+        # is not computed: the feedback law around the old one takes the difference.
+        def later(x: Array) -> np.ndarray:
+            known = np.asarray(x)
+            return np.concatenate([known[1:], known[-1:]]) if known.ndim else known
+
         search, horizon = self._search, len(self._blank.law.change)
         if not is_first:
             parts = {name: jax.tree.map(later, getattr(search, name)) for name in ("best", "models", "law")}
-            search = dataclasses.replace(search, **parts)
+            search = dataclasses.replace(search, **jax.device_put(parts))
         states = np.tile(start, (horizon + 1, 1)) if is_first else np.array(search.best.states)
         states[0] = start
         unknown = jax.device_put(np.full_like(search.best.cost, np.inf))
@@ -200,7 +205,8 @@ class Controller(Printed):
         """Run a part of an iteration, from a step of the plan on; its time is what the next is expected to take."""
         began, numbers = time.perf_counter(), eqx.filter(self.cost, eqx.is_inexact_array_like)
         part, begin = step
-        given = factor, following, np.int32(begin), np.bool_(is_first), self._noise(len(self.seconds))
+        noise = self._noise(len(self.seconds)) if part == PARTS[-1] else self._still
+        given = factor, following, np.int32(begin), np.bool_(is_first), noise
         self._search = jax.block_until_ready(self._programs[part](numbers, self._search, *given))
         self._last[step] = time.perf_counter() - began
         self._expected[step] = max(self._last[step], _FADING * self._expected[step])

@@ -92,9 +92,10 @@ def test_a_reset_controller_decides_as_at_first(controller):
 
 
 def test_a_moved_goal_is_planned_for_and_compiles_nothing(controller, compilations):
+    moved = GoalCost(jnp.asarray(np.array([2.0, 0.0])), 1.0, 10.0, 0.1)
     before, num_programs = controller(START), len(compilations)
     controller.reset()
-    controller.cost = GoalCost(jnp.asarray(np.array([2.0, 0.0])), 1.0, 10.0, 0.1)
+    controller.cost = moved
     assert controller(START) > before + 0.5
     assert len(compilations) == num_programs
 
