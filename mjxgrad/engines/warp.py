@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import logging
 import sys
-import weakref
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -36,11 +35,12 @@ _AT_ONCE = 2**32  # bytes of the worlds that are stepped in one call
 _ROOM = 48  # contacts of a world, unless `max_contacts` says
 _TILE = 64  # Warp reads rows in blocks of so many, beyond the end if they do not fit
 _MOTION = ("qpos", "qvel", "act")
-_GIVEN = (*_MOTION, "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "qacc_warmstart", "time")
+_INPUTS = ("qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat")
+_VARIED = (*_MOTION, "ctrl", *_INPUTS)  # by which there are derivatives
+_GIVEN = (*_VARIED, "qacc_warmstart", "time")
 _NUMBER = "model."  # before the names of the model's numbers that are not those of its file
-_INEXACT = (
-    1 << 9 | 1 << 10
-)  # bits of Warp's overflow: iterations of the solver and of its line search; others are of room
+# Bits of Warp's overflow: iterations of the solver and of its line search; others are of room.
+_INEXACT = 1 << 9 | 1 << 10
 _Values = dict[str, Array]
 
 
@@ -81,7 +81,7 @@ class _Scan(Scan):
     """The loop of a rollout by Warp."""
 
     def step(self, moving: Moving, data: mjx.Data) -> tuple[Any, Moving]:
-        found = _step(self.scene, state_of(data), data.ctrl, {name: getattr(data, name) for name in _GIVEN[4:8]})
+        found = _step(self.scene, state_of(data), data.ctrl, {name: getattr(data, name) for name in _INPUTS})
         parts = {name: found[name] for name in _MOTION} | {"time": found["time"], "warmstart": found["qacc_warmstart"]}
         return found, Moving(dataclasses.replace(moving.state, **parts), None)
 
@@ -100,7 +100,7 @@ class Worlds:
     """Steps of many worlds of one C model, and their differences."""
 
     def __init__(self, mj_model: mujoco.MjModel, room: int | None):
-        self._mj_model, self._runs = weakref.ref(mj_model), tree.joint_runs(mj_model)
+        self.mj_model, self._runs = mj_model, tree.joint_runs(mj_model)
         self._room = room or _ROOM
         dims = np.concatenate([mj_model.geom_condim, mj_model.pair_dim, [1]])
         self._rows = mj_model.nv + 6 * mj_model.neq + mj_model.njnt + 2 * mj_model.ntendon
@@ -112,25 +112,17 @@ class Worlds:
         try:
             with jax.ensure_compile_time_eval():  # also within a traced function
                 self._model = mjx.put_model(mj_model, impl="warp", graph_mode=warp and warp.JaxCallableGraphMode.NONE)
-            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(mj_model, 1)) if eqx.is_array(x))
+            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(1)) if eqx.is_array(x))
         except (NotImplementedError, RuntimeError) as error:
-            remedy = "" if "not installed" not in str(error) else ": pip install 'mjxgrad[warp]'"
-            raise SceneError(f"MuJoCo Warp cannot step it: {error}{remedy}") from error
+            raise SceneError(f"MuJoCo Warp cannot step it: {error}") from error
         self._run = custom_vmap(self._once)
         self._run.def_vmap(self._batched)
         self.step = jax.custom_jvp(self._step)
         self.step.defjvp(self._derived, symbolic_zeros=True)
 
-    @property
-    def mj_model(self) -> mujoco.MjModel:
-        """Return the C model."""
-        model = self._mj_model()
-        assert model is not None
-        return model
-
-    def _data(self, mj_model: mujoco.MjModel, count: int) -> mjx.Data:
+    def _data(self, count: int) -> mjx.Data:
         with jax.ensure_compile_time_eval():
-            return mjx.make_data(mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
+            return mjx.make_data(self.mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
 
     def _once(self, given: _Values) -> _Values:
         """Return the next states of worlds, which are the leading axis."""
@@ -146,7 +138,7 @@ class Worlds:
             parts = {k: x.reshape(num, each, *x.shape[1:]) for k, x in padded.items()}
             found = jax.lax.map(self._once, parts)
             return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
-        data = self._data(self.mj_model, count)
+        data = self._data(count)
         single = {k: x.astype(jnp.float32) for k, x in given.items()}
 
         def one(given: _Values) -> mjx.Data:
@@ -176,7 +168,7 @@ class Worlds:
         if numbers := [k.removeprefix(_NUMBER) for k in names if k.startswith(_NUMBER)]:
             told = f"MuJoCo Warp has no derivative by {', '.join(numbers)}"
             raise NotImplementedError(f"{told}: take scene.with_engine('mujoco'), or jax.lax.stop_gradient of it")
-        names = tuple(k for k in names if k in _GIVEN[:8])
+        names = tuple(k for k in names if k in _VARIED)
         zeros = {
             k: jnp.zeros_like(x) if eqx.is_inexact_array(x) else np.zeros(x.shape, jax.dtypes.float0)
             for k, x in found.items()
@@ -255,7 +247,7 @@ def worlds_of(mj_model: mujoco.MjModel, room: int | None) -> Worlds:
 
 
 def _given(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> _Values:
-    found = {name: getattr(scene.data, name) for name in _GIVEN[3:8]} | inputs
+    found = {name: getattr(scene.data, name) for name in _INPUTS} | inputs
     found |= {name: getattr(state, name) for name in _MOTION}
     found |= {"ctrl": ctrl, "qacc_warmstart": state.warmstart, "time": state.time}
     numbers = {_NUMBER + name: value for name, value in changed_numbers(scene).items()}

@@ -23,14 +23,12 @@ from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import conversions as rules
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
-from mjxgrad.scene.scene import Scene, SceneError, SceneWarning, check_installed, numbers_of
+from mjxgrad.scene.scene import OF_FILES, Scene, SceneError, SceneWarning, check_installed, numbers_of
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
 MOST_PAIRS = 20_000
 """Largest number of geom pairs; loading more takes minutes and is refused."""
-_OF_FILES: dict[EngineName | None, str] = {"mujoco": "C MuJoCo", "warp": "MuJoCo Warp"}
-"""Engines that step a file as it is."""
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -182,10 +180,8 @@ def _converted(
     """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
     original = copy.deepcopy(model)
     try:
-        if engine in _OF_FILES:
-            raise SceneError(
-                f"{name} was loaded for {_OF_FILES[engine]}: leave out engine={engine!r} to step it by MJX"
-            )
+        if engine is not None and engine in OF_FILES:
+            raise SceneError(f"{name} was loaded for {OF_FILES[engine]}: leave out engine={engine!r} to step it by MJX")
         if count_pairs(model) > MOST_PAIRS:
             raise SceneError(
                 f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "

@@ -35,6 +35,10 @@ _NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pai
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
+OF_FILES: dict[EngineName, str] = {"mujoco": "C MuJoCo", "warp": "MuJoCo Warp"}
+"""Engines that step a file as it is."""
+
+
 class SceneError(ValueError):
     """A scene cannot be loaded or stepped; the message has the element, the requirement and the remedy."""
 
@@ -215,7 +219,7 @@ class Scene(eqx.Module):
         unlike = () if self.unsupported else refusal_messages(self.mj_model, [UNLIKE, UNDECIDED, PARALLEL])
         sections = [
             _heading(self),
-            f"Stepped by C MuJoCo: {self.unsupported}" if self.unsupported else "",
+            f"Stepped by {OF_FILES[self.engine]}: {self.unsupported}" if self.unsupported else "",
             _contacts(self),
             _table("Converted", converted),
             _table("Left out", [(o.what, o.reason) for o in self.omissions]),
