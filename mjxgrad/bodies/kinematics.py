@@ -227,7 +227,9 @@ def inertia_of(model: mjx.Model, data: mjx.Data) -> Inertia:
     return Inertia(matrix, data._impl.cinert, data.cdof, armature, moves)
 
 
-def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duration: _Duration) -> _Position:
+def integrate_position(
+    model: mjx.Model | mujoco.MjModel, qpos: _Position, qvel: _Vector, duration: _Duration
+) -> _Position:
     """Return the position after a duration (s) at constant joint velocity; quaternions turn in their own frame."""
     parts = []
     for run in tree.joint_runs(model):
@@ -241,7 +243,7 @@ def integrate_position(model: mjx.Model, qpos: _Position, qvel: _Vector, duratio
     return jnp.concatenate(parts)
 
 
-def position_change(model: mjx.Model, start: _Position, end: _Position) -> _Vector:
+def position_change(model: mjx.Model | mujoco.MjModel, start: _Position, end: _Position) -> _Vector:
     """Return the velocity that moves one position to another in unit time; quaternions take the shorter turn."""
     # The inverse of `integrate_position`.
     parts = []

@@ -21,7 +21,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._mjx import mjx
-from mjxgrad.bodies import spatial, tree
+from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows
 from mjxgrad.engines.mjx import MJX, Moving, Scan, roll_out
 from mjxgrad.engines.mujoco import observed
@@ -100,8 +100,7 @@ class Worlds:
     """Steps of many worlds of one C model, and their differences."""
 
     def __init__(self, mj_model: mujoco.MjModel, room: int | None):
-        self.mj_model, self._runs = mj_model, tree.joint_runs(mj_model)
-        self._room = room or _ROOM
+        self.mj_model, self._room = mj_model, room or _ROOM
         dims = np.concatenate([mj_model.geom_condim, mj_model.pair_dim, [1]])
         self._rows = mj_model.nv + 6 * mj_model.neq + mj_model.njnt + 2 * mj_model.ntendon
         self._rows += self._room * max(1, 2 * (int(dims.max()) - 1))
@@ -218,26 +217,12 @@ class Worlds:
 
     def _to_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
         """Return a small change of positions in tangent space."""
-        parts = []
-        for run in self._runs:
-            at, moved = (x[run.qpos].reshape(-1, run.width) for x in (qpos, change))
-            if run.width > 1:
-                turn = 2.0 * spatial.multiply(spatial.conjugate(at[:, -4:]), moved[:, -4:])[:, 1:]
-                moved = jnp.concatenate([moved[:, :-4], turn], axis=1)
-            parts.append(moved.reshape(-1))
-        return jnp.concatenate(parts)
+        return jax.jvp(functools.partial(position_change, self.mj_model, qpos), (qpos,), (change,))[1]
 
     def _from_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
         """Return a small change in tangent space as one of positions."""
-        parts = []
-        for run in self._runs:
-            at = qpos[run.qpos].reshape(-1, run.width)
-            moved = change[run.dofs].reshape(len(at), -1)
-            if run.width > 1:
-                turn = jnp.pad(moved[:, -3:], ((0, 0), (1, 0)))
-                moved = jnp.concatenate([moved[:, :-3], 0.5 * spatial.multiply(at[:, -4:], turn)], axis=1)
-            parts.append(moved.reshape(-1))
-        return jnp.concatenate(parts)
+        moved = lambda change: integrate_position(self.mj_model, qpos, change, 1.0)  # noqa: E731
+        return jax.jvp(moved, (jnp.zeros_like(change),), (change,))[1]
 
 
 @functools.lru_cache(maxsize=16)
