@@ -124,7 +124,7 @@ class Moving(eqx.Module):
         if self.flight is None:
             data, flight = step(model, data, contact=contact), None
         else:
-            data, flight = pairs.follow(model, data, self.flight)
+            data, flight = pairs.follow(pairs.Program(model, data), self.flight)
         return data, Moving(state_of(data), flight)
 
 

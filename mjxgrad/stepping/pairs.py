@@ -39,7 +39,7 @@ from mjxgrad.bodies.kinematics import integrate_position, kinematics, position_c
 from mjxgrad.contact.collision import is_blind, slot_geoms
 from mjxgrad.stepping import assembly, slope
 from mjxgrad.stepping.contact import Discrete
-from mjxgrad.stepping.forward import advance, at_full_precision, smooth
+from mjxgrad.stepping.forward import advance, smooth
 
 # A landing quadruped's gradient takes 6 times the discrete one's time with 4, 9 with 8, 16 with 16 (two cores). Of means
 # after 0.2 s some are off by 3 standard errors with 4, none with 8.
@@ -54,7 +54,7 @@ _FORCES = ("ctrl", "qfrc_applied", "xfrc_applied", "time", "qacc_warmstart")  # 
 
 _Vector = Float[Array, " nv"]
 _Change = Float[Array, " size"]
-_Given = tuple[mjx.Model, mjx.Data]  # with None in place of leaves that are known
+_Given = tuple[mjx.Model, Any]  # and data, or what has its motion; with None in place of leaves that are known
 
 
 class Motion(NamedTuple):
@@ -100,49 +100,66 @@ def _in_flight(flight: Flight) -> _Change:
     return jnp.matmul(jax.lax.stop_gradient(flight.apart).T, flight.held, precision="highest")
 
 
-def taken(data: mjx.Data) -> Motion:
+def taken(data: Any) -> Motion:
     """Return what moves of data."""
     return Motion(data.qpos, data.qvel, data.act)
 
 
-def put(data: mjx.Data, motion: Motion) -> mjx.Data:
+def put(data: Any, motion: Motion) -> Any:
     """Return data with another motion."""
     return data.replace(**motion._asdict())
 
 
-def follow(model: mjx.Model, data: mjx.Data, flight: Flight) -> tuple[mjx.Data, Flight]:
+def follow(program: "Program", flight: Flight) -> tuple[Any, Flight]:
     """Take a motion, and what is in flight beside it, through a step; its derivative is then that along the motion alone."""
-    program = _Program(model, data)
 
     @jax.custom_jvp
-    def run(flight: Flight, given: _Given) -> tuple[mjx.Data, Flight]:
+    def run(flight: Flight, given: _Given) -> tuple[Any, Flight]:
         return _as_batched(given[1].qpos, (program.step(given), flight))
 
     def differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-        with at_full_precision(model, data):
+        with jax.default_matmul_precision("highest"):
             found, rates = _Step(program, *primals).differentiate(*tangents)
         return tuple(_as_batched(primals[1][1].qpos, x) for x in (found, rates))
 
     run.defjvp(differentiated, symbolic_zeros=True)
-    with at_full_precision(model, data):
+    with jax.default_matmul_precision("highest"):
         moved, after = run(flight, program.given)
     return moved, eqx.tree_at(lambda x: x.held, jax.lax.stop_gradient(after), after.held)
 
 
-class _Program:
+class Program:
     """The step and the rows of a model and its data, as functions of the leaves that only the running program knows."""
 
     # Known leaves stay known, so that a step leaves out what a scene does not need. Functions are traced once for all uses.
+    # Another engine has its own of both, and data with its own fields, which `replace` changes.
 
-    def __init__(self, model: mjx.Model, data: mjx.Data):
+    def __init__(self, model: mjx.Model, data: Any, *, is_single: bool = False):
+        self.is_single = is_single or data.qvel.dtype != jnp.float64
+        self.has_stages = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         is_unknown = jax.tree.map(lambda x: isinstance(x, jax.core.Tracer), (model, data))
         is_given = _put_in(is_unknown, Motion(True, True, True))  # pyright: ignore[reportArgumentType]
         self.given, self.known = eqx.partition((model, data), is_given)
-        self.step = jax.jit(lambda given: advance(*self.all_of(given), Discrete()))
-        self.rows = jax.jit(lambda given: rows_of(*_smoothed(*self.all_of(given))))
+        self.step = jax.jit(lambda given: self.advance(*self.all_of(given)))
+        self.rows = jax.jit(lambda given: self.near(*self.all_of(given)))
 
     def all_of(self, given: _Given) -> _Given:
         return eqx.combine(given, self.known)
+
+    def advance(self, model: mjx.Model, data: Any) -> Any:
+        """Return data one step later."""
+        return advance(model, data, Discrete())
+
+    def near(self, model: mjx.Model, data: Any) -> "Gaps | None":
+        """Return the contacts and limits of data."""
+        return gaps_of(model, smooth(model, data)[0])
+
+    def near_after(self, given: _Given, ends: Any) -> "Gaps | None":
+        """Return those of the state before a step, from the data after it."""
+        # A step's data belongs to its state; that of several stages to the last of them.
+        if self.has_stages:
+            return self.rows(given)
+        return gaps_of(self.all_of(given)[0], put(ends, taken(given[1])))
 
 
 def _put_in(given: _Given, motion: Motion) -> _Given:
@@ -158,6 +175,7 @@ class _Near(NamedTuple):
     widths: Float[Array, " all"]
     times: Float[Array, " all"]
     chosen: Bool[Array, " all"]
+    is_contact: Bool[Array, " all"]
 
 
 class _Events(NamedTuple):
@@ -184,12 +202,12 @@ class _Plan(NamedTuple):
 class _Step:
     """One step of a motion and of its pairs. All but the derivative along the motion is a constant to further derivatives."""
 
-    def __init__(self, program: _Program, flight: Flight, given: _Given):
+    def __init__(self, program: Program, flight: Flight, given: _Given):
         self.program, self.given = program, given
         self.flight, self.still = jax.lax.stop_gradient((flight, given))
         self.model, self.now = program.all_of(self.still)[0], taken(self.still[1])
         self.nv, self.size, self.dtype = self.model.nv, flight.apart.shape[1], self.now.qvel.dtype
-        self.has_stages = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+        self.has_stages, self.is_single = program.has_stages, program.is_single
 
     def differentiate(self, given_flight: Flight, tangents: _Given) -> tuple[Any, Any]:
         """Return data and flight after the step, and the tangents of both."""
@@ -199,7 +217,7 @@ class _Step:
         others = _put_in(others, Motion(False, False, False))  # pyright: ignore[reportArgumentType]
         (values, fixed), rates = eqx.partition(self.given, others), eqx.filter(tangents, others)
 
-        def moved_by(change: _Change, values: _Given) -> tuple[mjx.Data, mjx.Data]:
+        def moved_by(change: _Change, values: _Given) -> tuple[Any, Any]:
             motion = _with_change(program.all_of(self.given)[0], now, change)
             step = program.step(_put_in(eqx.combine(values, fixed), motion))
             return eqx.partition(step, eqx.is_inexact_array)
@@ -208,9 +226,8 @@ class _Step:
         moved = eqx.combine(found, rest)
         change = self._tangent(now.qpos, taken(tangents[1]))
         heard = _dense(given_flight.held, flight.held)
-        # A step's data belongs to its state; that of several stages to the last of them.
         ends = jax.lax.stop_gradient(moved)
-        rows = program.rows(self.still) if self.has_stages else rows_of(self.model, put(ends, self.now))
+        rows = program.near_after(self.still, ends)
         after = flight
         if rows is not None:
             events, plan, after = self._followed(rows, ends)
@@ -229,12 +246,13 @@ class _Step:
         rates = eqx.combine(along(change, rates), still[0])
         return (moved, after), (rates, eqx.tree_at(lambda x: x.held, still[1], heard))
 
-    def _followed(self, rows: "_Rows", moved: mjx.Data) -> tuple[_Events, _Plan, Flight]:
+    def _followed(self, rows: "Gaps", moved: Any) -> tuple[_Events, _Plan, Flight]:
         """Return the events of the step, who goes on and who begins, and the flight after the step."""
         flight = self.flight
         near = self._near(rows, moved.qvel)
-        modes = lambda near, lengths: self._by_modes(near, rows.is_contact, lengths)  # noqa: E731
-        events = sparsely(modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), flight.lengths)
+        events = sparsely(
+            self._by_modes, jnp.any(near.chosen)[None], jax.tree.map(lambda x: x[None], near), flight.lengths
+        )
         events = jax.tree.map(lambda x: x[0], events)
         events, plan, reach = self._plan(events)
         felt = flight.apart @ self._felt(events).T  # slots modes
@@ -259,7 +277,7 @@ class _Step:
         scale = jnp.concatenate([lengths, by_speed, jnp.zeros(self.size - 2 * self.nv, self.dtype)])
         return jnp.linalg.norm(scale * change, axis=1)
 
-    def _near(self, every: "_Rows", after: _Vector) -> _Near:
+    def _near(self, every: "Gaps", after: _Vector) -> _Near:
         """Return which contacts and limits may begin or end in the step, with the velocity after it."""
         model, h, rows, gaps, solimp = self.model, self.model.opt.timestep, every.rows, every.gaps, every.solimp
         rate = rows @ self.now.qvel
@@ -278,11 +296,11 @@ class _Step:
         is_near = jnp.where(every.is_blind, (gaps < 0) & (gaps > -2 * widths), jnp.abs(gaps - centres) < widths)
         is_met = jnp.abs(gaps) < h * jnp.abs(rate)
         times = -jnp.where(is_met, gaps, 0.0) / jnp.where(is_met, rate, 1.0)
-        if self.dtype != jnp.float64:  # pairs are farther apart, but what rests beside the window is no event
+        if self.is_single:  # pairs are farther apart, but what rests beside the window is no event
             widths = jnp.maximum(widths, _COARSER * slope.SMALLEST)
-        return _Near(rows, gaps, centres, widths, times, is_near & jumps)
+        return _Near(rows, gaps, centres, widths, times, is_near & jumps, every.is_contact)
 
-    def _by_modes(self, near: _Near, is_contact: tuple[bool, ...], lengths: _Vector) -> _Events:
+    def _by_modes(self, near: _Near, lengths: _Vector) -> _Events:
         """Return the nearest as modes, and displacements that change one mode alone and carry no other row across zero."""
         count = min(len(self.flight.widths), len(near.gaps))
         far = jnp.where(near.chosen, jnp.abs(near.gaps - near.centres) / near.widths, jnp.inf)
@@ -290,7 +308,7 @@ class _Step:
         is_event, scaled = near.chosen[index], near.rows / lengths
         own = jnp.where(is_event[:, None], scaled[index], 0.0)
         # Contacts that share coordinates, also by others between them, belong together.
-        shares = (own != 0) & jnp.asarray(np.array(is_contact))[index][:, None]
+        shares = (own != 0) & near.is_contact[index][:, None]
         same = (shares[:, None] & shares).any(axis=2) | np.eye(count, dtype=bool)
         for _ in range(math.ceil(math.log2(count))):
             same = (same[:, :, None] & same).any(axis=1)
@@ -410,7 +428,7 @@ class _Step:
         return Motion(qpos, self.now.qvel + by_speed, self.now.act + by_act)
 
     def _small(self, changes: Float[Array, "slots 2 size"]) -> Float[Array, "slots 2 1"]:
-        lengths, widths = self.flight.lengths, _SMALL if self.dtype == jnp.float64 else _SMALL_IN_SINGLE
+        lengths, widths = self.flight.lengths, _SMALL_IN_SINGLE if self.is_single else _SMALL
         scale = jnp.concatenate(
             [lengths / widths[0], lengths / widths[1], jnp.full(self.size - 2 * self.nv, 1 / widths[1])]
         )
@@ -432,7 +450,7 @@ class _Step:
         return off <= slope.ALIKE * self._scaled(apart)
 
 
-class _Rows(eqx.Module):
+class Gaps(eqx.Module):
     """All contacts and limits of a state."""
 
     rows: Float[Array, "all nv"]  # J of their normals
@@ -440,14 +458,10 @@ class _Rows(eqx.Module):
     solimp: Float[Array, "all 5"]  # their impedances
     is_blind: Bool[Array, " all"]  # whose distance is known only where they overlap
     acceleration: _Vector  # free motion, without contact
-    is_contact: tuple[bool, ...] = eqx.field(static=True)  # which are contacts, by themselves
+    is_contact: Bool[Array, " all"]
 
 
-def _smoothed(model: mjx.Model, data: mjx.Data) -> tuple[mjx.Model, mjx.Data]:
-    return model, smooth(model, data)[0]
-
-
-def rows_of(model: mjx.Model, data: mjx.Data) -> _Rows | None:
+def gaps_of(model: mjx.Model, data: mjx.Data) -> Gaps | None:
     """Return all contacts and limits of data whose fields are those of its state; None if the scene has none."""
     blocks = assembly.gather(model, data)
     blocks = [block for block in blocks if block.rows_each]
@@ -463,10 +477,8 @@ def rows_of(model: mjx.Model, data: mjx.Data) -> _Rows | None:
             blind[-1] |= is_blind(model, (data._impl.contact.geom if slots is None else slots)[contacts])
     firsts = [(block.residual[:: block.rows_each], block.solimp[:: block.rows_each]) for block in blocks]
     gaps, solimp = (jnp.concatenate(x) for x in zip(*firsts, strict=True))
-    kinds = tuple(
-        block.slots is not None for block, (own, _) in zip(blocks, firsts, strict=True) for _ in range(len(own))
-    )
-    return _Rows(jnp.concatenate(rows), gaps, solimp, jnp.concatenate(blind), data.qacc_smooth, kinds)
+    kinds = np.repeat([block.slots is not None for block in blocks], [len(own) for own, _ in firsts])
+    return Gaps(jnp.concatenate(rows), gaps, solimp, jnp.concatenate(blind), data.qacc_smooth, jnp.asarray(kinds))
 
 
 def _lengths(model: mjx.Model, data: mjx.Data) -> _Vector:

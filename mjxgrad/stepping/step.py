@@ -26,16 +26,16 @@ def step(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) -> 
         where the iterations, or the digits of the precision, did not suffice.
 
     Raises:
-        ValueError: if `model` or `data` belong to another implementation of MJX, or contact is none of the four records, has
-            a leading axis, or asks for C MuJoCo.
+        ValueError: if `model` or `data` belong to another implementation of MJX, or contact is none of the four records or has
+            a leading axis.
         NotImplementedError: if MJX lacks the integrator.
     """
-    check_contact(contact, is_step=True)
+    check_contact(contact)
     with at_full_precision(model, data):
         if model.opt.integrator not in (_Integrator.mjINT_EULER, _Integrator.mjINT_IMPLICITFAST, _Integrator.mjINT_RK4):
             kind = model.opt.integrator
             raise NotImplementedError(f"integrator must be Euler, implicitfast or RK4, got {kind}: set it in <option>")
         if not isinstance(contact, Slope):
             return advance(model, data, contact)
-        moved, flight = pairs.follow(model, data, pairs.no_flight(model, data))
+        moved, flight = pairs.follow(pairs.Program(model, data), pairs.no_flight(model, data))
         return pairs.put(moved, pairs.whole(model, pairs.taken(moved), flight))

@@ -1,0 +1,268 @@
+"""Steps of many worlds by MuJoCo Warp in one call, their derivatives by differences, and what is near their states."""
+
+import copy
+import functools
+import logging
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from mjxgrad._mjx import mjx
+from mjxgrad.batched.device import own_device
+from mjxgrad.bodies.kinematics import integrate_position, position_change
+from mjxgrad.engines import events
+from mjxgrad.scene import SceneError
+from mjxgrad.stepping import pairs, slope
+
+_POSITION, _OTHER = 3e-5, 1e-3  # widths of differences (m or rad; m/s, rad/s or the unit of an input)
+_CLEAR = 1.5  # times what differences of positions move a gap, from which they cross no surface
+_LOOSE = 1e-3  # of the squared rows of surfaces that are cleared: they may depend on each other
+_AT_ONCE = 2**32  # bytes of the worlds that are stepped in one call
+_ROOM = 48  # contacts of a world, unless `max_contacts` says
+_TILE = 64  # Warp reads rows in blocks of so many, beyond the end if they do not fit
+_NEAREST = 24  # contacts and limits of a world that its slope looks at
+_FAR = 1e3  # m or rad: the gap of none
+_JOINT, _TENDON = (getattr(mujoco.mjtConstraint, f"mjCNSTR_LIMIT_{name}").value for name in ("JOINT", "TENDON"))
+_CONTACT = mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS.value  # and beyond
+_PYRAMID = mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL.value
+MOTION = ("qpos", "qvel", "act")
+INPUTS = ("qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat")
+_VARIED = (*MOTION, "ctrl", *INPUTS)  # by which there are derivatives
+GIVEN = (*_VARIED, "qacc_warmstart", "time")
+NUMBER = "model."
+"""What the names of the model's numbers begin with that are not those of its file."""
+Values = dict[str, Array]
+
+
+class Worlds:
+    """Steps of many worlds of one C model, and their differences."""
+
+    def __init__(self, mj_model: mujoco.MjModel, room: int | None):
+        self.mj_model, self._room = mj_model, room or _ROOM
+        dims = np.concatenate([mj_model.geom_condim, mj_model.pair_dim, [1]])
+        self._rows = mj_model.nv + 6 * mj_model.neq + mj_model.njnt + 2 * mj_model.ntendon
+        self._rows += self._room * max(1, 2 * (int(dims.max()) - 1))
+        self._rows = -(-self._rows // _TILE) * _TILE
+        has_limits = mj_model.jnt_limited.any() or mj_model.tendon_limited.any()
+        self.has_surfaces = bool(has_limits or mj_model.nflex or mj_model.npair or (mj_model.geom_contype > 0).any())
+        try:
+            self._model = _put(mj_model)
+            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(1)) if eqx.is_array(x))
+        except (NotImplementedError, RuntimeError) as error:
+            raise SceneError(f"MuJoCo Warp cannot step it: {error}") from error
+        self._run, self._run_near = self._of_many(self._after), self._of_many(self._surfaces)
+        self.step = jax.custom_jvp(self._step)
+        self.step.defjvp(self._derived, symbolic_zeros=True)
+
+    def _data(self, count: int) -> mjx.Data:
+        with jax.ensure_compile_time_eval():
+            return mjx.make_data(self.mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
+
+    def _of_many(self, function: Callable[[mjx.Data, Values, Values], Values]) -> Callable[[Values], Values]:
+        """Return a function of many worlds, which are the leading axis of all."""
+
+        # One call of Warp takes all of a batch, as far as memory goes. The function takes Warp's data, what of it is given, and
+        # numbers of the model, of one world.
+        @custom_vmap
+        def run(given: Values) -> Values:
+            count = len(given["qpos"])
+            most = max(1, _AT_ONCE // self._size)
+            if count > most:
+                num = -(-count // most)
+                each = -(-count // num)
+                padded = {
+                    k: jnp.pad(x, [(0, num * each - count)] + [(0, 0)] * (x.ndim - 1), mode="edge")
+                    for k, x in given.items()
+                }
+                found = jax.lax.map(run, {k: x.reshape(num, each, *x.shape[1:]) for k, x in padded.items()})
+                return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
+            data = self._data(count)
+
+            def one(given: Values) -> Values:
+                numbers = {k.removeprefix(NUMBER): x for k, x in given.items() if k.startswith(NUMBER)}
+                return function(data.replace(**{k: x for k, x in given.items() if k in GIVEN}), given, numbers)
+
+            found = jax.vmap(one)({k: x.astype(jnp.float32) for k, x in given.items()})
+            dtype = given["qpos"].dtype
+            return {k: x.astype(dtype) if eqx.is_inexact_array(x) else x for k, x in found.items()}
+
+        @run.def_vmap
+        def _(size: int, is_batched: list, given: Values) -> tuple[Values, dict]:
+            (flags,) = is_batched
+            whole = {k: x if flags[k] else jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()}
+            found = run({k: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]) for k, x in whole.items()})
+            found = {k: x.reshape(size, len(x) // size, *x.shape[1:]) for k, x in found.items()}
+            return found, dict.fromkeys(found, True)
+
+        return run
+
+    def _after(self, data: mjx.Data, given: Values, numbers: Values) -> Values:
+        after = mjx.step(self._model.tree_replace(numbers) if numbers else self._model, data)
+        found = {k: getattr(after, k) for k in (*MOTION, "time", "qacc_warmstart", "sensordata")}
+        return found | {"overflow": after._impl.overflow.reshape(())}
+
+    @functools.cached_property
+    def _far(self) -> mjx.Model:
+        """The model whose rows are wanted, and not the solution."""
+        model = copy.deepcopy(self.mj_model)
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        model.opt.iterations = model.opt.ls_iterations = 1
+        return _put(model)
+
+    @functools.cached_property
+    def _levers(self) -> Float[np.ndarray, "nbody nv"]:
+        return events.levers_of(self.mj_model)
+
+    def _surfaces(self, data: mjx.Data, given: Values, numbers: Values) -> Values:
+        """Return the nearest contacts and limits of a world."""
+        model = self.mj_model
+        # As `events.Surfaces` does: margins are larger by what a state travels in half a step, at most.
+        least, levers = slope.LEAST_WIDTH * slope.USUAL_WIDTH, self._levers
+        stages = 1.5 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
+        travel = stages * numbers.get("opt.timestep", model.opt.timestep) * jnp.abs(data.qvel)
+        contact = least + jax.lax.top_k(levers @ travel, 2)[0].sum()
+        limit = least + max(1.0, levers.max(initial=0.0)) * travel.sum()
+        more = {"geom_margin": contact / 2, "pair_margin": contact, "jnt_margin": limit, "tendon_margin": limit}
+        margins = {k: numbers.get(k, jnp.asarray(getattr(model, k))) + x for k, x in more.items()}
+        margins = {k: x.astype(jnp.float32) for k, x in margins.items()}
+        found = mjx.forward(self._far.tree_replace(numbers | margins), data)
+        rows, kind, index = found._impl.efc__J[:, : model.nv], found._impl.efc__type, found._impl.efc__id
+        is_contact, is_joint = kind >= _CONTACT, kind == _JOINT
+        is_first = jnp.concatenate([jnp.ones(1, bool), (index[1:] != index[:-1]) | ~is_contact[:-1]])
+        is_one = (is_contact & is_first) | is_joint | (kind == _TENDON)
+        is_one &= jnp.arange(len(kind)) < found._impl.nefc.reshape(())
+        gaps = found._impl.efc__pos - found._impl.efc__margin + jnp.where(is_contact, contact, limit)
+        gaps = jnp.where(is_one, gaps, _FAR)
+        nearest = jax.lax.top_k(-jnp.abs(gaps), min(_NEAREST, len(gaps)))[1]
+        is_contact, is_joint, index = is_contact[nearest], is_joint[nearest], index[nearest]
+        # The first two edges of a pyramid, n + μt and n - μt, have the normal as their mean.
+        other = nearest + (kind[nearest] == _PYRAMID)
+        normals = 0.5 * (rows[nearest] + rows.at[other].get(mode="clip"))
+        solimp = found._impl.contact__solimp.at[index].get(mode="clip")
+        for name, is_own in (("jnt_solimp", is_joint), ("tendon_solimp_lim", ~is_contact & ~is_joint)):
+            table = numbers.get(name, jnp.asarray(getattr(model, name), jnp.float32))
+            if len(table):
+                solimp = jnp.where(is_own[:, None], table.at[index].get(mode="clip"), solimp)
+        is_one = is_one[nearest]
+        return {
+            "rows": jnp.where(is_one[:, None], normals, 0.0), "gaps": gaps[nearest], "solimp": solimp,
+            "is_contact": is_contact, "is_blind": jnp.zeros_like(is_contact), "acceleration": found.qacc_smooth,
+        }  # fmt: skip
+
+    def near(self, given: Values) -> pairs.Gaps:
+        """Return the nearest contacts and limits of a world, as constants."""
+        found = self._run_near(jax.tree.map(lambda x: jax.lax.stop_gradient(x)[None], given))
+        return pairs.Gaps(**{k: x[0] for k, x in found.items()})
+
+    def _step(self, given: Values) -> Values:
+        return {k: x[0] for k, x in self._run({k: x[None] for k, x in given.items()}).items()}
+
+    def _derived(self, primals: tuple, tangents: tuple) -> tuple[Values, dict[str, Any]]:
+        (given,), (changes,) = primals, tangents
+        found = self.step(given)
+        names = tuple(k for k, x in given.items() if x.size and not isinstance(changes[k], SymbolicZero))
+        if numbers := [k.removeprefix(NUMBER) for k in names if k.startswith(NUMBER)]:
+            told = f"MuJoCo Warp has no derivative by {', '.join(numbers)}"
+            raise NotImplementedError(f"{told}: take scene.with_engine('mujoco'), or jax.lax.stop_gradient of it")
+        names = tuple(k for k in names if k in _VARIED)
+        zeros = {
+            k: jnp.zeros_like(x) if eqx.is_inexact_array(x) else np.zeros(x.shape, jax.dtypes.float0)
+            for k, x in found.items()
+        }
+        if not names:
+            return found, zeros
+        parts = [self._to_tangent(given[k], changes[k]) if k == "qpos" else changes[k].reshape(-1) for k in names]
+        moved = jnp.matmul(self.derivative(given, names), jnp.concatenate(parts), precision="highest")
+        sizes = [self.mj_model.nv, self.mj_model.nv, self.mj_model.na]
+        qpos, qvel, act, sensed = jnp.split(moved, np.cumsum(sizes))
+        return found, zeros | {
+            "qpos": self._from_tangent(found["qpos"], qpos), "qvel": qvel, "act": act, "sensordata": sensed,
+        }  # fmt: skip
+
+    def derivative(self, given: Values, names: tuple[str, ...]) -> Float[Array, "outputs columns"]:
+        """Return the derivative of the next state, in tangent space, and of readings by what is given, by central differences."""
+        dtype, points, widths = given["qpos"].dtype, [], []
+        given = {k: jax.lax.stop_gradient(x).astype(jnp.float32) for k, x in given.items()}  # so that widths are Warp's
+        if self.has_surfaces:
+            given = given | {"qpos": self._beside(given)}
+        for name in names:
+            size = self.mj_model.nv if name == "qpos" else given[name].size
+            away = (_POSITION if name == "qpos" else _OTHER) * jnp.eye(size, dtype=jnp.float32)
+            ends = [self._moved(given, name, sign * away) for sign in (1.0, -1.0)]
+            widths.append(self._apart(name, ends[0], ends[1]))
+            points += [
+                {k: jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()} | {name: end} for end in ends
+            ]
+        found = self._run({k: jnp.concatenate([one[k] for one in points]) for k in given})
+        ends = np.cumsum([0] + [len(one["qpos"]) for one in points])
+        columns = []
+        for i, width in enumerate(widths):
+            after, before = ({k: x[ends[j] : ends[j + 1]] for k, x in found.items()} for j in (2 * i, 2 * i + 1))
+            apart = [jax.vmap(self._to_tangent)(before["qpos"], after["qpos"] - before["qpos"])]
+            apart += [after[k] - before[k] for k in ("qvel", "act", "sensordata")]
+            columns.append(jnp.concatenate(apart, axis=1) / width[:, None])
+        return jnp.concatenate(columns).T.astype(dtype)
+
+    def _beside(self, given: Values) -> Float[Array, " nq"]:
+        """Return the position moved to where differences cross no surface: contact and limits begin with a jump."""
+        near = self.near(given)
+        least = _CLEAR * _POSITION * jnp.max(jnp.abs(near.rows), axis=1)
+        is_close = jnp.abs(near.gaps) < least
+        shift = jnp.where(is_close, jnp.where(near.gaps < 0, -least, least) - near.gaps, 0.0)
+        rows = jnp.where(is_close[:, None], near.rows, 0.0)
+        square = jnp.matmul(rows, rows.T, precision="highest")
+        square += jnp.diag(jnp.where(is_close, _LOOSE * jnp.diag(square), 1.0))
+        change = jnp.matmul(jax.scipy.linalg.solve(square, shift, assume_a="pos"), rows, precision="highest")
+        return self._moved(given, "qpos", change[None])[0]
+
+    def _moved(self, given: Values, name: str, changes: Float[Array, "columns size"]) -> Array:
+        if name != "qpos":
+            return given[name] + changes.reshape(-1, *given[name].shape)
+        return given["qpos"] + jax.vmap(functools.partial(self._from_tangent, given["qpos"]))(changes)
+
+    def _apart(self, name: str, after: Array, before: Array) -> Float[Array, " columns"]:
+        """Return how far apart points are that were rounded."""
+        if name != "qpos":
+            return jnp.sum((after - before).reshape(len(after), -1), axis=1)
+        return jnp.diagonal(jax.vmap(self._to_tangent)(before, after - before))
+
+    def _to_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
+        """Return a small change of positions in tangent space."""
+        return jax.jvp(functools.partial(position_change, self.mj_model, qpos), (qpos,), (change,))[1]
+
+    def _from_tangent(self, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+        """Return a small change in tangent space as one of positions."""
+        moved = lambda change: integrate_position(self.mj_model, qpos, change, 1.0)  # noqa: E731
+        return jax.jvp(moved, (jnp.zeros_like(change),), (change,))[1]
+
+
+@functools.lru_cache(maxsize=16)
+def worlds_of(mj_model: mujoco.MjModel, room: int | None) -> Worlds:
+    """Return the worlds of a C model, with room for so many contacts each."""
+    return Worlds(mj_model, room)
+
+
+def _put(mj_model: mujoco.MjModel) -> mjx.Model:
+    """Return Warp's model; it says nothing of what it lacks room for, which the step counts."""
+    warp = sys.modules.get("warp")
+    if warp:
+        warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # a library must not print
+    with jax.ensure_compile_time_eval():  # also within a traced function
+        model = mjx.put_model(mj_model, impl="warp", graph_mode=_graph_mode(warp))
+    return model.tree_replace({"opt._impl.warn_overflow": 0})
+
+
+def _graph_mode(warp: Any) -> Any:
+    """Return how Warp's kernels are launched: one by one, or on a GPU as a graph over buffers of its own."""
+    # A graph over JAX's buffers would be captured for every set of addresses, and a scan's inputs lie elsewhere in each step.
+    modes = warp and warp.JaxCallableGraphMode
+    return modes and (modes.NONE if own_device().platform == "cpu" else modes.WARP_STAGED)
