@@ -25,6 +25,10 @@ from mjxgrad.stepping import slope
 
 # Stages of a step that are done.
 _NONE, _PLACES, _SPEEDS = (getattr(mujoco.mjtStage, f"mjSTAGE_{name}").value for name in ("NONE", "POS", "VEL"))
+# What sensors of places read, without collisions; and those of velocities.
+_PLACED = (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_flex, mujoco.mj_tendon, mujoco.mj_transmission,
+           mujoco.mj_sensorPos)  # fmt: skip
+_MOVED = (mujoco.mj_fwdPosition, mujoco.mj_sensorPos, mujoco.mj_fwdVelocity, mujoco.mj_sensorVel)
 WIDTH = 1e-6  # of small differences of whole steps, as MuJoCo's documentation has it; of parameters as a share of their value
 _NARROW = 4e-9  # of those by inverse dynamics, with room
 _ONE_SIDE = 1e-7  # of differences to one side: their error is in proportion
@@ -112,6 +116,7 @@ class Worker:
         if given is not self.given:
             self.given, self.model, self.others = given, copy.deepcopy(given), None
             self.inverse, self.is_explicit = Inverse(self.model, self.layout), inverse.has_inverse(self.model)
+            self.sensed = _sensed(self.model)
             self.surfaces = Surfaces(self.model, self.levers)
             self.far, self.stepper = mujoco.MjData(self.surfaces.model), Stepper(self.model, self.layout, 1)
         self.surfaces.widen(speeds if gradient == "slope" else 0 * speeds)
@@ -408,7 +413,14 @@ class Worker:
         """Return the readings in a state; `done` says which stages are those of the last state that was read."""
         model, data = self.inverse.model, self.inverse.data
         mujoco.mj_setState(model, data, row, EVERY)
-        mujoco.mj_forwardSkip(model, data, done, False)
+        if self.sensed == _PLACES:
+            for stage in _PLACED:
+                stage(model, data)
+        elif self.sensed == _SPEEDS:
+            for stage in _MOVED if done == _NONE else _MOVED[2:]:
+                stage(model, data)
+        else:
+            mujoco.mj_forwardSkip(model, data, done, False)
         return data.sensordata.copy()
 
     def _by_sensors(self, row: np.ndarray, found: _Found) -> None:
@@ -417,7 +429,7 @@ class Worker:
         model, layout, place = self.inverse.model, self.layout, self.layout.places["ctrl"]
         self._read(row)
         # What needs fewer stages comes first, while those of the row are known.
-        for column in range(model.nu if "ctrl" in found else 0):
+        for column in range(model.nu if "ctrl" in found and self.sensed is None else 0):
             own, ends = slice(column, column + 1), []
             up, down, width = self.inverse.sides(row[place][own], WIDTH, own)
             for value in (up, down):
@@ -426,10 +438,12 @@ class Worker:
                 ends.append(self._read(moved, _SPEEDS))
             found["ctrl"][:, column] = (ends[0] - ends[1]) / width
         is_plain = layout.num_changes == 2 * model.nv + model.na  # without histories of delays
-        for column in [*range(model.nv, layout.num_changes), *range(model.nv)]:
-            change = WIDTH * np.eye(1, layout.num_changes, column)
+        num_felt = {_PLACES: model.nv, _SPEEDS: 2 * model.nv, None: layout.num_changes}[self.sensed]
+        changes = WIDTH * np.array([1.0, -1.0])[:, None] * np.eye(num_felt, layout.num_changes)[:, None]
+        starts = layout.moved(row, changes)
+        for column in [*range(model.nv, num_felt), *range(model.nv)]:
             done = _PLACES if is_plain and column >= model.nv else _NONE
-            above, below = (self._read(layout.moved(row, side * change)[0], done) for side in (1.0, -1.0))
+            above, below = (self._read(start, done) for start in starts[column])
             found["state"][:, column] = (above - below) / (2 * WIDTH)
         for name in (one for one in found if is_other(one)):
             for column, (put, size, is_zero) in enumerate(self._changes(self.inverse, row, name)):
@@ -504,6 +518,16 @@ class Worker:
         mujoco.mj_step(by.model, by.data)
         mujoco.mj_getState(by.model, by.data, end := np.empty_like(row), EVERY)
         return end
+
+
+def _sensed(model: mujoco.MjModel) -> int | None:
+    """Return the stage after which all sensors can be read, where that is not the last: no solver is needed for places."""
+    # A function of the user's may read anything; energies are no sensor's own affair.
+    others = [getattr(mujoco.mjtSensor, f"mjSENS_{name}") for name in ("USER", "PLUGIN", "E_POTENTIAL", "E_KINETIC")]
+    if np.isin(model.sensor_type, others).any() or model.nhistory or model.nplugin or not model.nsensor:
+        return None
+    stage = model.sensor_needstage.max()
+    return int(stage) if stage in (_PLACES, _SPEEDS) else None
 
 
 def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) -> np.ndarray:
