@@ -6,7 +6,7 @@ import importlib.util
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import get_args
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -266,6 +266,14 @@ def _native(model: mujoco.MjModel) -> dict[str, np.ndarray | float]:
     return {name: value for name, value in every.items() if isinstance(value, float) or is_array(value)}
 
 
+_NEWTON = mujoco.mjtSolver.mjSOL_NEWTON
+
+
+def _options(scene: Scene) -> Any:
+    """Return the options that decide how a scene is stepped; where MJX cannot, its model has only places and numbers."""
+    return scene.model.opt if scene.engine == "mjx" else scene.mj_model.opt
+
+
 def _heading(scene: Scene) -> str:
     model, opt = scene.mj_model, scene.model.opt
     sizes = (
@@ -281,14 +289,17 @@ def _heading(scene: Scene) -> str:
         (model.nsensor, "sensor", "sensors"),
     )
     counted = [f"{n} {one if n == 1 else many}" for n, one, many in sizes if n]
-    integrator = mujoco.mjtIntegrator(opt.integrator).name.removeprefix("mjINT_")
-    cone = mujoco.mjtCone(opt.cone).name.removeprefix("mjCONE_").lower()
+    kept = _options(scene)
+    integrator = mujoco.mjtIntegrator(kept.integrator).name.removeprefix("mjINT_")
+    cone = mujoco.mjtCone(kept.cone).name.removeprefix("mjCONE_").lower()
+    # MJX's own step is by Newton's method alone.
+    solver = mujoco.mjtSolver(kept.solver if scene.engine != "mjx" else _NEWTON).name.removeprefix("mjSOL_")
     gravity = np.linalg.norm(np.asarray(opt.gravity))
     options = (
         f"time step {1e3 * float(opt.timestep):g} ms",
         integrator if integrator == "RK4" else integrator.capitalize(),
         f"{cone} cones" + (f", impratio {float(opt.impratio):g}" if opt.impratio != 1 else ""),
-        f"Newton to {format_number(float(opt.tolerance))} in {opt.iterations} iterations",
+        f"{solver.replace('NEWTON', 'Newton')} to {format_number(float(opt.tolerance))} in {kept.iterations} iterations",
         f"gravity {gravity:.3g} m/s²",
         str(scene.data.qpos.dtype),
     )
@@ -308,7 +319,7 @@ def _contacts(scene: Scene) -> str:
     if not scene.unsupported:
         slots, every = scene.data._impl.ncon, sum(map(len, candidates(scene.model).values()))
         title += f"; room for {slots} contacts of {every}" if slots < every else f", at {every} points"
-    is_euler = scene.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+    is_euler = _options(scene).integrator != mujoco.mjtIntegrator.mjINT_RK4
     legend = "effective k and b = 2ζ√k, per mass of the contact"
     legend += "; stable while h²k + 2hb < 4" if is_euler else ""
     if len(rows) < count:

@@ -35,6 +35,17 @@ def test_sizes_and_options_are_shown(scene):
         assert part in options
 
 
+@pytest.mark.parametrize("solver", ["CG", "Newton"])
+def test_what_c_mujoco_steps_has_the_options_of_its_file(solver):
+    """MJX's model of such a scene has places and numbers alone."""
+    text = BALL_WALL.replace(
+        "<option ", f'<option integrator="implicit" cone="elliptic" solver="{solver}" iterations="7" '
+    )
+    options = load_scene(text, engine="mujoco").summary().splitlines()[2]
+    for part in ("Implicit,", "elliptic cones", f"{solver} to", "in 7 iterations"):
+        assert part in options
+
+
 def test_effective_contact_parameters_are_shown_for_each_pair(scene):
     # solref 0.02 1: k = 1/0.02² = 2500, b = 2/0.02 = 100, h²k + 2hb = 0.01 + 0.4.
     common = ["3", "0.02", "1", "2500", "100", "1", "0.9–0.95", "1", "0.41", "1"]
