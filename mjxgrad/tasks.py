@@ -1,56 +1,24 @@
-"""Scenes with a cost and noise: a throw over a wall, gymnasium's hopper, and the classes for your own."""
+"""A scene with a cost and noise, a throw over a wall; the classes for your own; and scenes by name."""
 
 from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from mjxgrad.contact import Softness
-from mjxgrad.objective import ActionNoise, ParameterNoise, closed_loop, linear_policy, open_loop, parameter_noise
-from mjxgrad.objective.base import Stddev
-from mjxgrad.objective.task import InScene, Outcome, PolicyFunction, SceneTask, Task, finite_cost
-from mjxgrad.rollouts import State, Trajectory, initial_state, rollout
+from mjxgrad.objective import ParameterNoise, parameter_noise
+from mjxgrad.objective.task import InScene, Outcome, SceneTask, Task, finite_cost
+from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene, load_scene
 
-__all__ = [
-    "ActionTask", "BallWall", "Outcome", "SceneTask", "Task", "ball_wall", "hopper", "scene_path", "wall_softness",
-]  # fmt: skip
+__all__ = ["BallWall", "Outcome", "SceneTask", "Task", "ball_wall", "scene_path", "wall_softness"]
 
 # Beside the package in a checkout, inside it when installed from a wheel.
 _FOLDERS = (Path(__file__).parents[1] / "mjcf", Path(__file__).parent / "mjcf")
 # Only the wall is softened: on a softer floor the ball would also sink in and slide farther.
 WALL_CONTACT = (("ball", "wall"),)
-# Of the hopper. Bent legs absorb the landing; with the downward speed the foot lands after 70 ms.
-START_POSE = (0.0, 1.22, 0.0, -0.4, -0.5, 0.3)  # m, m, rad
-START_VELOCITY = (0.5, -1.0, 0.0, 0.0, 0.0, 0.0)
-# In actions per rad and per rad/s; an action of 1 is 200 Nm.
-STIFFNESS, DAMPING = (0.5, 0.5, 0.3), (0.05, 0.05, 0.03)
-
-
-class ActionTask(SceneTask):
-    """A task with an objective of its own; see `SceneTask`.
-
-    Attributes:
-        start_params: start of the optimisation: the controls, or the policy's parameters.
-        policy: function from its parameters and a state to controls; None is open loop.
-        stddev: default standard deviation of the noise on the actions, in their units.
-    """
-
-    start_params: PyTree = eqx.field(kw_only=True)
-    policy: PolicyFunction | None = eqx.field(kw_only=True, default=None)
-    stddev: float = eqx.field(static=True, kw_only=True, default=0.1)
-
-    def objective(self, stddev: Stddev | None = None, softness: Softness | None = None) -> ActionNoise:
-        """Return the cost under noise on the actions, a function of the controls or of the policy's parameters.
-
-        The standard deviation is in units of the controls, by default the task's; a softness of None leaves it unchanged.
-        """
-        task, stddev = self.with_softness(softness), self.stddev if stddev is None else stddev
-        if self.policy is None:
-            return open_loop(task, stddev)
-        return closed_loop(task, self.policy, stddev, params=self.start_params)
 
 
 class BallWall(InScene):
@@ -100,36 +68,6 @@ def wall_softness(stiffness: float | Float[Array, "..."]) -> Softness:
     """
     stiffness = jnp.asarray(stiffness, float)
     return Softness(stiffness, jnp.ones_like(stiffness), pairs=WALL_CONTACT)
-
-
-def hopper(*, horizon: int = 150) -> ActionTask:
-    """Return gymnasium's hopper, dropped: the foot lands after 70 ms, and the cost depends on the torso's final position.
-
-    Nothing in it jumps, yet the discrete derivative is wrong for every parameter that shifts the time of landing: the
-    impedance is not zero at first touch. Steps are Euler's, of 2 ms, at a quarter of the cost of gymnasium's RK4. The policy
-    observes angles and speeds of the three joints. At first it holds the posture like springs and dampers.
-    """
-    scene = robot_scene("hopper")
-    policy, zero = linear_policy(6, 3, observe=_joints)
-    stiffness, damping = jnp.array(STIFFNESS), jnp.array(DAMPING)
-    gain = -jnp.concatenate([jnp.diag(stiffness), jnp.diag(damping)], axis=1)
-    offset = stiffness * jnp.array(START_POSE[3:])
-    posture = eqx.tree_at(lambda layer: (layer.weight, layer.bias), zero, (gain, offset))
-    state = initial_state(scene, jnp.array(START_POSE), jnp.array(START_VELOCITY))
-    # The number of controls is the scene's; pyright expects an argument, since `Task` declares a variable.
-    return ActionTask(  # pyright: ignore[reportCallIssue]
-        scene=scene, state=state, cost=_jump_cost, horizon=horizon, policy=policy, start_params=posture
-    )
-
-
-def _jump_cost(trajectory: Trajectory) -> Float[Array, ""]:
-    """Return minus the forward distance minus the final height of the torso, in m."""
-    return -trajectory.qpos[-1, 0] - trajectory.qpos[-1, 1]
-
-
-def _joints(state: State) -> Float[Array, " 6"]:
-    """Return the angles of thigh, leg and foot in rad, then their speeds in rad/s."""
-    return jnp.concatenate([state.qpos[3:], state.qvel[3:]])
 
 
 def scene_path(name: str) -> Path:
