@@ -21,7 +21,7 @@ def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
         SceneError: if MJX would have to step it, and cannot.
     """
     check_contact(contact)
-    engine = ENGINES[getattr(contact, "engine", None) or scene.engine]
+    engine = ENGINES[scene.engine]
     is_able = engine is not ENGINES["mjx"] or not scene.unsupported
     if isinstance(contact, engine.contacts) and is_able:
         return engine

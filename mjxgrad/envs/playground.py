@@ -56,7 +56,7 @@ def stepped_right(environment: Foreign, *, contact: Contact = Discrete(), iterat
     Raises:
         ValueError: if contact does not suit `mg.step`.
     """
-    check_contact(contact, is_step=True)
+    check_contact(contact)
 
     def own_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         most = max(iterations, model.opt.iterations)

@@ -225,7 +225,7 @@ class SceneSystem(System):
         )
 
     def with_contact(self, contact: Contact) -> "SceneSystem":
-        check_contact(contact, is_step=True)
+        check_contact(contact)
         return dataclasses.replace(self, contact=contact)
 
 

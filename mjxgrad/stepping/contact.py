@@ -11,7 +11,6 @@ All are pytrees. Lengths and widths are leaves, so a sweep over them is one `jax
 """
 
 import dataclasses
-import warnings
 from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
@@ -26,47 +25,27 @@ Gradient = Literal["discrete", "slope"]
 """Names of the derivatives along MuJoCo's own motion, for command lines and files; see `own_motion`."""
 
 
-class OwnMotion(eqx.Module):
-    """MuJoCo's own motion, to the bit: the common part of `Discrete` and `Slope`.
+class Discrete(eqx.Module):
+    """MuJoCo's own motion, to the bit, with the derivative of each step, equal to its finite differences."""
 
-    Attributes:
-        engine: who steps it, in place of `scene.engine`; going, with a `FutureWarning`: take `scene.with_engine`.
-    """
-
-    # A plain string, so that unknown names reach the check below, which lists the choices.
-    engine: str | None = eqx.field(static=True, default=None)
-    gradient: ClassVar[Gradient]
-
-    def __check_init__(self):
-        if self.engine is not None and self.engine not in get_args(EngineName):
-            raise ValueError(f'engine must be "mjx", "mujoco" or None, got {self.engine!r}')
-        if self.engine is not None:
-            told = (
-                f"contact says no longer who steps: take scene.with_engine({self.engine!r}) and {type(self).__name__}()"
-            )
-            warnings.warn(told, FutureWarning, stacklevel=4)
+    gradient: ClassVar[Gradient] = "discrete"
 
 
-class Discrete(OwnMotion):
-    """MuJoCo's own motion, with the derivative of each step, equal to its finite differences; see `OwnMotion`."""
-
-    gradient = "discrete"
-
-
-class Slope(OwnMotion):
-    """MuJoCo's own motion, with the derivative whose mean is the slope of the outcome; see `OwnMotion`.
+class Slope(eqx.Module):
+    """MuJoCo's own motion, to the bit, with the derivative whose mean is the slope of the outcome.
 
     It knows that a change moves the times of contact and limit events. Both engines have it by the same rule: `engines.events`
     and `engines.flight` say which, `stepping.pairs` has it for MJX.
     """
 
-    gradient = "slope"
+    gradient: ClassVar[Gradient] = "slope"
 
 
-Contact = Discrete | Slope | Onset | Smoothing
+OwnMotion = Discrete | Slope
+Contact = OwnMotion | Onset | Smoothing
 
 
-def own_motion(gradient: str) -> Discrete | Slope:
+def own_motion(gradient: str) -> OwnMotion:
     """Return the record of a derivative along MuJoCo's own motion, by its name.
 
     Raises:
@@ -76,8 +55,8 @@ def own_motion(gradient: str) -> Discrete | Slope:
     return Slope() if gradient == "slope" else Discrete()
 
 
-def check_contact(contact: Any, *, is_step: bool = False) -> None:
-    """Refuse anything but one of the four records, lengths with a leading axis, and in a step of MJX the engine of C MuJoCo."""
+def check_contact(contact: Any) -> None:
+    """Refuse anything but one of the four records, and lengths with a leading axis."""
     if not isinstance(contact, Contact):
         given = f'"{contact}"' if isinstance(contact, str) else repr(contact)
         raise ValueError(f"contact must be mg.Discrete(), mg.Slope(), mg.Onset() or mg.Smoothing(), got {given}")
@@ -87,5 +66,3 @@ def check_contact(contact: Any, *, is_step: bool = False) -> None:
             raise ValueError(
                 f"{field.name} must be one value for a step, got shape {value.shape}: sweep under jax.vmap"
             )
-    if is_step and getattr(contact, "engine", None) == "mujoco":
-        raise ValueError('contact must have engine None or "mjx" in a step of MJX, got "mujoco": use mg.rollout')

@@ -73,7 +73,7 @@ def forward(model: mjx.Model, data: mjx.Data, *, contact: Contact = Discrete()) 
     Raises:
         ValueError: as `step`.
     """
-    check_contact(contact, is_step=True)
+    check_contact(contact)
     with at_full_precision(model, data):
         return _forward(model, data, contact)
 

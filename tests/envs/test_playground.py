@@ -79,11 +79,6 @@ def test_other_threads_step_as_ever(falling, monkeypatch):
     assert len(results) == 1
 
 
-def test_c_mujoco_is_refused_at_once(falling):
-    with pytest.raises(ValueError, match=r'got "mujoco": use mg\.rollout'):
-        playground.stepped_right(falling[0], contact=Slope("mujoco"))
-
-
 @pytest.fixture(scope="module")
 def menagerie(tmp_path_factory):
     """Stands in for the download of the Go1's meshes, which are for the eye: its bodies have masses and its feet spheres."""
