@@ -1,7 +1,6 @@
 """The result of a descent: last and best parameters, the history, and the reason for stopping."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mjxgrad._text import Paged, Printed, format_range
+from mjxgrad._text import Printed, format_range
 from mjxgrad.estimators import Reason
 from mjxgrad.loop.run import Progress
-from mjxgrad.report import Block, page, svg
 
 
 class Stopped(eqx.Enumeration):
@@ -136,7 +134,7 @@ class History(Record, Printed):
         return cls(**fields, seconds=np.cumsum(progress.seconds))
 
 
-class Optimisation(eqx.Module, Paged):
+class Optimisation(eqx.Module, Printed):
     """The result of a run, or of one run per seed; all fields but the seconds then have a leading axis.
 
     Attributes:
@@ -180,19 +178,3 @@ class Optimisation(eqx.Module, Paged):
         spent = f"{self.seconds:.3g} s, and {self.compile_seconds:.3g} s to compile"
         text = f"Best cost {cost} after {steps} steps, {skipped} skipped: {reasons}{self.history.about_alpha}."
         return f"{text} {rollouts} rollouts took {spent}."
-
-    def as_html(self) -> str:
-        """Return the run as a self-contained page; needs `mjxgrad[render]`."""
-        shown = (("cost under noise", self.history.cost), ("α", self.history.alpha))
-        known = [one for one in shown if np.isfinite(one[1]).any()]
-        drawings = [svg(functools.partial(_over_steps, *one), one[0]) for one in known]
-        return page(str(self).partition(":")[0] + ".", "mjxgrad optimise", [Block(text=str(self), drawings=drawings)])
-
-
-def _over_steps(name: str, values: Float[np.ndarray, "*seeds steps"]) -> Any:
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(4.6, 2.7), layout="constrained")
-    axis.plot(values.reshape(-1, values.shape[-1]).T, color="#0072b2", lw=1)
-    axis.set(xlabel="step", ylabel=name)
-    return figure

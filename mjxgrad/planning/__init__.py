@@ -3,7 +3,7 @@
 from mjxgrad.planning.controller import Controller
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Sampled, Smoother
 from mjxgrad.planning.system import Cost, FunctionSystem, GoalCost, LeastSquares, SceneSystem, System
-from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory, shifted
+from mjxgrad.planning.trajectory import Iterations, Plan, optimise_trajectory
 from mjxgrad.planning.tree import Tree, TreePath
 
 __all__ = [
@@ -24,5 +24,4 @@ __all__ = [
     "Tree",
     "TreePath",
     "optimise_trajectory",
-    "shifted",
 ]

@@ -320,17 +320,6 @@ def _improved(problem: Problem, start: StateVector, controls: _Controls, factors
     )
 
 
-def shifted(plan: Plan | Course, num_steps: ArrayLike = 1) -> _Controls:
-    """Return the controls of a plan some steps later, the last one held, as the next start of a receding horizon.
-
-    Args:
-        plan: the plan, whose first steps were taken.
-        num_steps: number of steps taken.
-    """
-    last = len(plan.controls) - 1
-    return plan.controls[jnp.minimum(jnp.arange(last + 1) + num_steps, last)]
-
-
 def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: _Scalar) -> Bool[Array, " n"]:
     """Return which coordinates of the state cost more than rounding but are moved by no control in any step."""
     n = models.A.shape[-1]

@@ -18,7 +18,6 @@ from mjxgrad.planning import (
     SceneSystem,
     Smoother,
     optimise_trajectory,
-    shifted,
 )
 from mjxgrad.planning.system import terminal_model
 from mjxgrad.planning.trajectory import minimise_in_box
@@ -158,11 +157,6 @@ def test_a_block_that_is_not_touched_is_pushed_home_by_smoothed_models():
     assert not plan.unmoved.any()
 
 
-def test_a_shifted_plan_goes_on_where_the_first_steps_end_and_holds_its_last_control():
-    plan = planned(jnp.array(2.0))
-    np.testing.assert_array_equal(shifted(plan, 2), [*plan.controls[2:], plan.controls[-1], plan.controls[-1]])
-
-
 def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves():
     plan = pushing(Exact())
     assert plan.cost == plan.start_cost
@@ -205,7 +199,7 @@ def test_to_plan_again_compiles_nothing(compilations):
             schedule=np.array([1.0, 0.5 - 0.1 * i]),
             upper=3.0 + i,
         )
-        given = shifted(plan)
+        given = plan.controls
         state = SceneSystem(scene, num_substeps=2).step(jnp.array([0.1 * i, 0.0]), jnp.ones(1))
         mg.rollout(
             scene, mg.initial_state(scene, state[:1], state[1:]), float(i) * jnp.ones((3, 1)), contact=mg.Onset()
