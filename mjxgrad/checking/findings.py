@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from mjxgrad._programs import patiently
@@ -22,6 +23,7 @@ from mjxgrad.scene import Scene, SceneError, load_scene
 _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
+_DEGREES = 10.0  # least share of a control range and its joint's that tells of degrees, which are 57 times rad
 _OFF = 0.25  # expected error of a derivative from which it is a fault
 _ENOUGH = 32  # motions
 _CLEAR = 0.1  # largest relative error of a usable slope
@@ -76,12 +78,35 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
         text = f"From {bad[0]} the motion is not finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
         yield Finding("not_finite", text, True)
+    if degrees := _in_degrees(scene.mj_model):
+        text = f"In degrees? The control range of {', '.join(degrees)} is over ten times that of its joint in rad"
+        yield Finding(
+            "degrees", f"{text}: MuJoCo's compiler turns ranges of joints into rad, but no control ranges.", True
+        )
     yield from _contact_findings(scene, motions)
     if motions.exact:
         yield Finding("note", exact_text(motions.exact))
     if motions.idle:
         text = f"No effect: {', '.join(motions.idle)}. A change of the control changes no position."
         yield Finding("no_effect", text, True)
+
+
+def _in_degrees(model: mujoco.MjModel) -> list[str]:
+    """Return the position servos of limited hinges whose control range is many times that of the hinge."""
+    found = []
+    for i in np.flatnonzero(model.actuator_ctrllimited & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)):
+        joint, is_of_joint = model.actuator_trnid[i, 0], model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        is_servo = 0 < model.actuator_gainprm[i, 0] == -model.actuator_biasprm[i, 1]
+        if (
+            is_of_joint
+            and is_servo
+            and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+            and model.jnt_limited[joint]
+        ):
+            reach = np.abs(model.actuator_gear[i, 0] * model.jnt_range[joint]).max()
+            if np.abs(model.actuator_ctrlrange[i]).max() > _DEGREES * reach:
+                found.append(model.actuator(i).name or f"actuator {i}")
+    return found
 
 
 def exact_text(pairs: Sequence[str]) -> str:
