@@ -101,6 +101,16 @@ def test_an_actuator_without_effect_is_named_and_no_other():
     assert not kinds(quick(ball(gear=1)))
 
 
+@pytest.mark.parametrize(("reach", "expected"), [("-90 90", {"degrees"}), ("-1.5 1.5", set()), ("-9 9", set())])
+def test_a_control_range_in_degrees_is_named(reach, expected):
+    """MuJoCo turns a joint's range into rad, and no control range; a servo that turns further than its joint is no mistake."""
+    scene = mg.load_scene(
+        f"""<mujoco><worldbody><body><joint name="j" range="-90 90"/><geom type="capsule" fromto="0 0 0 .3 0 0"
+        size=".02"/></body></worldbody><actuator><position name="servo" joint="j" kp="1" ctrlrange="{reach}"/></actuator></mujoco>"""
+    )
+    assert kinds(quick(scene)) & {"degrees"} == expected
+
+
 def test_contact_that_never_touches_is_named():
     """It falls for two seconds, 20 m."""
     assert "floor – ball" in fault(quick(ball(height=40, gear=0.1)), "no_contact")
