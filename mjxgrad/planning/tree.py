@@ -1,6 +1,6 @@
 r"""A rapidly exploring random tree whose metric is what a smoothed step can reach.
 
-From a state, controls within a reach $\rho$ of a nominal control $\bar u$ lead to the ellipsoid around the next state
+From a state, controls within a reach $\rho$ of the last control $\bar u$ lead to the ellipsoid around the next state
 $c = f(x, \bar u)$ with the axes of $B_\rho \rho$. The distance of a sample that is a change $e$ away from c is
 
     d² = eᵀ (B Bᵀ + Γ)⁻¹ e,    Γ = diag(resolution²),    B = B_ρ diag(ρ).
@@ -33,6 +33,8 @@ from mjxgrad.planning.system import ControlVector, StateVector, System
 _Nodes = dict[str, Any]
 _PerChange = Float[ArrayLike, " _"]
 _POSE, _EVERYTHING = 0, 1  # what counts of a sample: what the goal is about, or all
+_GOAL, _ELSEWHERE = 0.2, 0.3  # shares of the samples: the goal; states of which all counts
+_MOST_STEPS = 3  # towards one sample
 _PROGRESS = 0.98  # an extension goes on while each step leaves at most this share of the squared distance
 
 
@@ -65,10 +67,7 @@ class Tree:
 
     def __init__(
         self, system: System, goal: Float[ArrayLike, " state"], tolerance: _PerChange, *, smoother: Smoother,
-        lower: _PerChange, upper: _PerChange, resolution: _PerChange, reach: ArrayLike,
-        nominal: Callable[[StateVector, ControlVector], ControlVector] | None = None,
-        contact: Callable[[PRNGKeyArray, StateVector], StateVector] | None = None,
-        goal_share: float = 0.2, contact_share: float = 0.3, batch: int = 16, max_extension: int = 3,
+        lower: _PerChange, upper: _PerChange, resolution: _PerChange, reach: ArrayLike, batch: int = 16,
     ):  # fmt: skip
         """Keep what searches share.
 
@@ -80,24 +79,16 @@ class Tree:
             lower: least changes of the start that are sampled.
             upper: largest ones.
             resolution: change of each coordinate that needs no cause; infinite where one never matters, such as a speed.
-            reach: how far a step's controls go from the nominal one, a number or one per control.
-            nominal: nominal control in a state that a control led to; None holds that control, as suits position servos.
-            contact: state in which to begin elsewhere, from a key and a node's state; None is anywhere between the bounds,
-                but what the goal is about as in the node.
-            goal_share: share of the samples that are the goal.
-            contact_share: share of the samples that are from `contact`, of which all coordinates matter.
+            reach: how far a step's controls go from the last one, a number or one per control.
             batch: samples per turn; a step of all is one call.
-            max_extension: most steps towards one sample.
 
         Raises:
             ValueError: if shapes do not fit, a number is not positive, or no coordinate matters for the goal.
         """
         instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
         instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
-        self.system, self.smoother, self.contact, dtype = system, smoother, contact, system.origin.dtype
-        self.nominal = (lambda _, control: control) if nominal is None else nominal
-        self.batch, self.max_extension = whole("batch", batch), whole("max_extension", max_extension)
-        self.goal, self.goal_share, self.contact_share = np.asarray(goal, dtype), goal_share, contact_share
+        self.system, self.smoother, self.batch, dtype = system, smoother, whole("batch", batch), system.origin.dtype
+        self.goal = np.asarray(goal, dtype)
         given = {"tolerance": tolerance, "lower": lower, "upper": upper, "resolution": resolution}
         for name, value in given.items():
             if np.shape(value) != (system.num_changes,):
@@ -120,7 +111,7 @@ class Tree:
 
         Args:
             start: the first state.
-            control: control that led to the start, for `nominal`.
+            control: control that led to the start.
             key: consumed here.
             capacity: most nodes.
             max_seconds: most time (s), without compilation; it is looked at between turns.
@@ -144,7 +135,7 @@ class Tree:
             keys = jax.random.split(jax.random.fold_in(key, turn), self.batch)
             samples, kinds, at, distance = self._ran(self._chosen, nodes, size, keys, self.goal, start)
             here, is_on = {name: nodes[name][at] for name in new}, np.isfinite(distance)
-            for step in range(self.max_extension):
+            for step in range(_MOST_STEPS):
                 states, controls = self._ran(self._moved, here, samples, kinds)
                 here = self._ran(self._made, states, controls, keys, self.goal, samples, kinds)
                 is_on &= np.isfinite(states).all(axis=1) & ((here["distance"] < _PROGRESS * distance) | (step == 0))
@@ -171,11 +162,10 @@ class Tree:
         """Return nodes, with what each can reach, and the distance of a sample from it."""
 
         def one(state, control, key, sample, kind) -> _Nodes:
-            nominal = self.nominal(state, control)
-            B = self.smoother.linear_model(self.system, state, nominal, key).B * self.reach
+            B = self.smoother.linear_model(self.system, state, control, key).B * self.reach
             inverse = jnp.linalg.inv(jnp.eye(B.shape[1]) + jnp.einsum("nm,kn,np->kmp", B, self.weights, B))
             error = jnp.max(jnp.abs(self.system.difference(state, goal)) / self.tolerance)
-            node = {"state": state, "control": control, "centre": self.system.step(state, nominal), "B": B}
+            node = {"state": state, "control": control, "centre": self.system.step(state, control), "B": B}
             node |= {"inverse": inverse, "error": error}
             return node | {"distance": self._distance(node, sample, kind)[0]}
 
@@ -192,8 +182,7 @@ class Tree:
         """Return the next states towards samples, and their controls."""
         changes = jax.vmap(self._distance)(nodes, samples, kinds)[1]
         changes = self.reach * changes / jnp.maximum(1.0, jnp.abs(changes).max(axis=1, keepdims=True))
-        nominal = jax.vmap(self.nominal)(nodes["state"], nodes["control"])
-        controls = jnp.clip(nominal + changes, *self.system.control_limits)
+        controls = jnp.clip(nodes["control"] + changes, *self.system.control_limits)
         return jax.vmap(self.system.step)(nodes["state"], controls), controls
 
     def _chosen(self, nodes: _Nodes, size: Array, keys: Array, goal: StateVector, start: StateVector):
@@ -202,14 +191,14 @@ class Tree:
 
         def one(key):
             kind_key, place_key, node_key, best_key, seen_key = jax.random.split(key, 5)
-            share, is_best = jax.random.uniform(kind_key), jax.random.uniform(best_key) < self.goal_share
+            share, is_best = jax.random.uniform(kind_key), jax.random.uniform(best_key) < _GOAL
             base = nodes["state"][jnp.where(is_best, best, jax.random.randint(node_key, (), 0, size))]
             place = jax.random.uniform(place_key, self.lower.shape, start.dtype, self.lower, self.upper)
+            # To begin elsewhere, what the goal is about stays as in a node.
             held = jnp.where(self.weights[_POSE] > 0, self.system.difference(base, start), place)
-            other = self.system.retract(start, held) if self.contact is None else self.contact(place_key, base)
-            kind = jnp.where(share > 1 - self.contact_share, _EVERYTHING, _POSE)
-            anywhere = jnp.where(kind == _EVERYTHING, other, self.system.retract(start, place))
-            sample = jnp.where(share < self.goal_share, goal, anywhere)
+            kind = jnp.where(share > 1 - _ELSEWHERE, _EVERYTHING, _POSE)
+            anywhere = self.system.retract(start, jnp.where(kind == _EVERYTHING, held, place))
+            sample = jnp.where(share < _GOAL, goal, anywhere)
             found = jax.vmap(lambda node: self._distance(node, sample, kind)[0])(nodes)
             # Each sample sees half of the nodes: the nearest of all, if it can go no further, would else be tried for ever.
             is_there = nodes["is_node"] & jnp.isfinite(found)

@@ -8,35 +8,36 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.engines.pool import Pool
-from mjxgrad.planning import Exact, FunctionSystem, Sampled, SceneSystem, Tree
+from mjxgrad.planning import Exact, FunctionSystem, Sampled, SceneSystem, Tree, tree
 from mjxgrad.planning.tree import _EVERYTHING, _POSE
 
 INF, START, GOAL = np.inf, np.array([-0.5, 0.0]), np.array([0.0, 1.0])
+CONTROL = START[:1]  # the finger is there
 
 
 def push(state, control):
     """A finger goes where it is told; a box on its right, 0.2 m wide and 0.1 m high, is pushed ahead of it."""
-    finger = state[0] + control[0]
-    return jnp.stack([finger, jnp.maximum(state[1], finger + 0.1)])
+    return jnp.stack([control[0], jnp.maximum(state[1], control[0] + 0.1)])
 
 
 def tree_of(smoother, **others):
     given = {"lower": [-1.0, -0.2], "upper": [2.0, 1.2], "resolution": [0.1, 0.1]} | others
     given = {name: np.array(x) if isinstance(x, list) else x for name, x in given.items()}
-    given = {"reach": 0.3, "batch": 8, "nominal": lambda state, control: jnp.zeros(1)} | given
-    return Tree(FunctionSystem(push, 2, 1), GOAL, np.array([INF, 0.05]), smoother=smoother, **given)
+    return Tree(
+        FunctionSystem(push, 2, 1), GOAL, np.array([INF, 0.05]), smoother=smoother, **{"reach": 0.3, "batch": 8} | given
+    )
 
 
 @pytest.fixture(scope="module")
 def found():
     with jax.enable_x64(True):
-        return tree_of(Sampled(None, 0.3, 30)).search(START, np.zeros(1), jax.random.key(1), capacity=400)
+        return tree_of(Sampled(None, 0.3, 30)).search(START, CONTROL, jax.random.key(1), capacity=400)
 
 
 def test_a_push_is_found_from_where_nothing_touches(found):
     assert found.found
     assert abs(found.states[-1, 1] - 1) <= 0.05
-    assert np.abs(found.controls).max() <= 0.3 + 1e-12
+    assert np.abs(np.diff([CONTROL, *found.controls], axis=0)).max() <= 0.3 + 1e-12
 
 
 def test_a_path_is_the_rollout_of_its_controls(found):
@@ -53,28 +54,20 @@ def test_errors_are_distances_in_tolerances_and_parents_come_first(found):
     assert (found.parents[1:] < np.arange(1, len(found.parents))).all()
 
 
-def test_without_smoothing_the_goal_alone_moves_nothing():
+def test_without_smoothing_the_goal_alone_moves_nothing(monkeypatch):
     """The derivative of the box by the finger is zero before the touch, so that no control takes it nearer."""
-    alone = {"goal_share": 1.0, "contact_share": 0.0}
-    key, control = jax.random.key(0), np.zeros(1)
-    plain = tree_of(Exact(), **alone).search(START, control, key, capacity=60)
+    monkeypatch.setattr(tree, "_GOAL", 1.0)
+    monkeypatch.setattr(tree, "_ELSEWHERE", 0.0)
+    key = jax.random.key(0)
+    plain = tree_of(Exact()).search(START, CONTROL, key, capacity=60)
     assert (plain.nodes == START).all()
-    smoothed = tree_of(Sampled(None, 0.4, 30), **alone).search(START, control, key, capacity=60)
+    smoothed = tree_of(Sampled(None, 0.4, 30)).search(START, CONTROL, key, capacity=60)
     assert smoothed.nodes[:, 1].max() > 0.8
 
 
 def test_the_same_key_finds_the_same(found):
-    again = tree_of(Sampled(None, 0.3, 30)).search(START, np.zeros(1), jax.random.key(1), capacity=400)
+    again = tree_of(Sampled(None, 0.3, 30)).search(START, CONTROL, jax.random.key(1), capacity=400)
     np.testing.assert_array_equal(again.nodes, found.nodes)
-
-
-def test_the_contact_is_where_a_tree_goes():
-    """All samples are a finger at 0.4 m short of its node's box: the nodes go there from 0.5 m."""
-    contact = lambda key, state: state.at[0].set(state[1] - 0.4)  # noqa: E731
-    tree = tree_of(Exact(), goal_share=0.0, contact_share=1.0, contact=contact)
-    nodes = tree.search(START, np.zeros(1), jax.random.key(0), capacity=20).nodes
-    # The regularised step ends short by the share resolution² / (resolution² + reach²).
-    np.testing.assert_allclose(nodes[1:, 0], -0.4, atol=0.1 * 0.01 / (0.01 + 0.09) + 1e-12)
 
 
 @pytest.mark.parametrize("kind", [_POSE, _EVERYTHING])
@@ -84,14 +77,14 @@ def test_distance_and_control_are_those_of_the_dense_ellipsoid(kind):
     A, B = rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
     system = FunctionSystem(lambda x, u: A @ x + B @ u, 3, 2)
     resolution, reach = np.array([0.3, 0.5, 0.2]), np.array([0.7, 1.3])
-    tree = Tree(
+    grown = Tree(
         system, np.ones(3), np.array([1.0, INF, 1.0]), smoother=Exact(), lower=-np.ones(3), upper=np.ones(3),
         resolution=resolution, reach=reach, batch=1,
     )  # fmt: skip
     state, control, sample = rng.normal(size=3), rng.normal(size=2), rng.normal(size=3)
     given = [jnp.asarray(x)[None] for x in (state, control)]
     keys, kinds = jax.random.split(jax.random.key(0), 1), jnp.array([kind])
-    node = tree._made(*given, keys, jnp.ones(3), sample[None], kinds)
+    node = grown._made(*given, keys, jnp.ones(3), sample[None], kinds)
     counts = [0, 2] if kind == _POSE else [0, 1, 2]
     away = (sample - A @ state - B @ control)[counts]
     axes, widths = (B * reach)[counts], np.diag(resolution[counts] ** 2)
@@ -99,7 +92,7 @@ def test_distance_and_control_are_those_of_the_dense_ellipsoid(kind):
     np.testing.assert_allclose(node["distance"][0], expected, rtol=1e-12)
     weight = np.linalg.inv(widths)
     best = np.linalg.solve(np.eye(2) + axes.T @ weight @ axes, axes.T @ weight @ away)
-    _, chosen = tree._moved(node, sample[None], kinds)
+    _, chosen = grown._moved(node, sample[None], kinds)
     np.testing.assert_allclose(chosen[0], control + reach * best / max(1, np.abs(best).max()), rtol=1e-12)
 
 
@@ -117,11 +110,11 @@ def test_a_path_by_c_mujoco_is_its_replay_and_each_step_of_a_batch_is_one_call(m
         return function(*given, **settings)
 
     monkeypatch.setattr(Pool, "run", run)
-    tree = Tree(
+    grown = Tree(
         SceneSystem(scene, num_substeps=10), np.array([0.9, 0.0]), np.array([0.02, INF]), smoother=Sampled(None, 0.1, 10),
         lower=np.array([-1.0, 0.0]), upper=np.array([1.0, 0.0]), resolution=np.array([0.05, INF]), reach=0.2, batch=4,
     )  # fmt: skip
-    found = tree.search(np.zeros(2), np.zeros(1), jax.random.key(0), capacity=200)
+    found = grown.search(np.zeros(2), np.zeros(1), jax.random.key(0), capacity=200)
     assert found.found
     # A linear model and the nominal step of the root; these and a step of each further batch.
     assert counts["run"] == 2 + 3 * found.num_steps // 4
