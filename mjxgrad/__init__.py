@@ -1,6 +1,6 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
-from mjxgrad import _mjx  # noqa: F401  # isort: skip
+from mjxgrad import _mjx  # isort: skip
 from mjxgrad import baselines, diagnostics, envs, estimators, identification, learning, planning, tasks
 from mjxgrad._programs import keep_compiled
 from mjxgrad.batched import over_devices
@@ -15,6 +15,7 @@ from mjxgrad.rollouts import DivergedError, Linearisation, State, Trajectory, in
 from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.stepping import Discrete, Onset, Slope, Smoothing, contact_force, forward, solve, step
 
+_mjx.imported()
 linearize, optimize = linearise, optimise  # as the field spells them
 
 __all__ = [

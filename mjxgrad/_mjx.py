@@ -1,4 +1,7 @@
-"""The first import of JAX and MuJoCo, where a wrong variable of the environment ends in a sentence; the only one of MJX.
+"""The first import of JAX and MuJoCo, where a wrong variable or Ctrl-C ends in a sentence; the only one of MJX.
+
+An import takes seconds, and C++ that runs meanwhile swallows a KeyboardInterrupt at times. So Ctrl-C ends a command at once,
+which has nothing to keep yet; in a program it is raised, and again where it was lost, once the import is done.
 
 `mujoco.mjx` prints two lines to stdout if NVIDIA Warp is absent, which this library does not use.
 A library must not print, and stdout may carry a program's results. Only those two lines are
@@ -10,13 +13,43 @@ import contextlib
 import importlib.metadata
 import io
 import os
+import signal
 import sys
+import threading
+
+_BEGAN = [os.path.basename(word) for word in sys.orig_argv[1:3]]  # noqa: PTH119 - as text, for the import is not done
+IS_COMMAND = _BEGAN[:1] == ["mjxgrad"] or _BEGAN == ["-m", "mjxgrad"]
+_heard: list[int] = []
+
+
+def _hear(number: int, frame: object) -> None:
+    if IS_COMMAND:
+        os.write(2, b"interrupted\n")
+        os._exit(130)
+    _heard.append(number)
+    raise KeyboardInterrupt
+
+
+def imported() -> None:
+    """Give Ctrl-C back to the program once all is imported, and raise what was lost."""
+    if signal.getsignal(signal.SIGINT) is not _hear or IS_COMMAND:  # the command has a handler of its own, later
+        return
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if _heard:
+        raise KeyboardInterrupt
+
+
+if (
+    threading.current_thread() is threading.main_thread()
+    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+):
+    signal.signal(signal.SIGINT, _hear)
 
 try:
     importlib.import_module("jax")
 except ValueError as error:
     _told = f"JAX refuses the environment: {error}; JAX's switches are true or false, 1 or 0"
-    if not sys.argv[0].endswith(("-m", "mjxgrad")):
+    if not IS_COMMAND:
         raise ValueError(_told) from None
     print(_told, file=sys.stderr)  # the command line
     sys.exit(2)

@@ -191,6 +191,39 @@ def test_a_signal_within_a_long_computation_ends_the_process_within_a_second_or_
     assert spent < 15  # a second on an idle core
 
 
+# On the way to the first module of that name, once; an importer that swallows the interrupt stands for C++ that does.
+INTERRUPTED = """
+import os, signal, sys
+class Importer:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            sys.meta_path.remove(self)
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                sum(range(10**6))
+            except KeyboardInterrupt:
+                if not {is_lost}: raise
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Importer())
+"""
+
+
+@pytest.mark.parametrize("module", ["jax", "optax", "cyclopts"])
+def test_a_command_that_is_interrupted_while_it_is_imported_says_so_in_a_word(tmp_path, module):
+    name = tmp_path / "mjxgrad"
+    name.write_text(INTERRUPTED.format(module=module, is_lost=True) + "from mjxgrad.cli import main\nmain(['--help'])")
+    done = python(str(name), PYTHONPATH=str(Path(mg.__file__).parents[1]))
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize("is_lost", [True, False])
+def test_an_interruption_of_an_import_reaches_the_program_even_if_it_was_swallowed(is_lost):
+    code = INTERRUPTED.format(module="optax", is_lost=is_lost)
+    told = "try:\n import mjxgrad\nexcept KeyboardInterrupt:\n print('told')"
+    done = python("-c", code + told)
+    assert done.stdout.splitlines()[0] == "told", done.stderr
+
+
 def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatch):
     assert cli.main(["new", scene]) == 0
     assert "video" not in capsys.readouterr().err
