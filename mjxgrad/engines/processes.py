@@ -149,8 +149,11 @@ def serve() -> None:
             pools[key].write({name: value[piece] for name, value in found.items()}, *arguments)
         except Exception as problem:
             error = problem
-        pickle.dump(error, told, pickle.HIGHEST_PROTOCOL)
-        told.flush()
+        try:
+            pickle.dump(error, told, pickle.HIGHEST_PROTOCOL)
+            told.flush()
+        except BrokenPipeError:  # whoever asked was killed
+            os._exit(0)
 
 
 def _remember(pools: dict, key: int, value: Any) -> None:

@@ -73,6 +73,12 @@ def test_what_a_process_says_is_raised(other):
         other.share(0, model, 1, {"state": (1,)}, lambda piece: ({},))
 
 
+def test_one_whose_parent_was_killed_ends_in_silence():
+    ask = "import os, pickle; from mjxgrad.engines.processes import Processes; child = Processes(1).children[0]; "
+    ask += "pickle.dump((0, None, ('nowhere', {}, slice(0), ())), child.stdin); child.stdin.flush(); os._exit(0)"
+    assert run_python("-c", ask) == ("", "")  # waits until the child has closed its output
+
+
 def test_a_function_of_this_process_in_a_step_keeps_it_here():
     assert are_possible()
     mujoco.set_mjcb_control(lambda model, data: None)
