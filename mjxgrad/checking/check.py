@@ -291,7 +291,8 @@ import jax.numpy as jnp
 import mjxgrad as mg
 {more}
 scene = mg.load_scene({path!r}{settings}){yours}
-cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}  # yours, m or rad: here how far it comes
+# Your cost, from a trajectory to a number; here how far it comes (m or rad).
+cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}
 start = mg.initial_state(scene{_keyframe(scene)})
 task = mg.SceneTask(scene, start, cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
 """

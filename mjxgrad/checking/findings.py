@@ -183,7 +183,8 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     if jumps:
         line = max(jumps, key=lambda one: float(one.jumps.sizes.max()))
         pairs = name_pairs(line.changed)
-        text = f"The outcome jumps along a change of {line.varied}: {pairs} touches on one side only."
+        verb = "touches" if len(line.changed) == 1 else "touch"
+        text = f"The outcome jumps along a change of {line.varied}: {pairs} {verb} on one side only."
         yield Finding("jump", f"{text} No derivative sees that; alpha_order does.", True)
     growth = np.array([line.growth for line in measured.lines])
     largest = float(np.nanmax(growth, initial=0.0))

@@ -20,6 +20,7 @@ _GREY = 40  # largest difference of a grey's colour components, of 255
 _IMAGES = "<style>@media (prefers-color-scheme: dark) { image { filter: invert(1) hue-rotate(180deg) } }</style>"
 # A figure opened by itself has no page colours.
 _ALONE = f"color-scheme: light dark; color: {INK}; color: light-dark({INK}, #e7eaef)"
+_UNIT = re.compile(r"(?<=\d) (?=(?:%|[smNh]|[mµ]s|mm|min|rad|Hz|kg|1/s²?|m/s²?|rad/s)(?![\w/]))")
 _XMLNS = ' xmlns="http://www.w3.org/2000/svg"'
 
 
@@ -129,8 +130,10 @@ def _for_both(found: re.Match) -> str:
 
 
 def _prose(text: object) -> str:
-    """Escape a sentence, with code between backticks; no line ends within a name."""
+    """Escape a sentence, with code between backticks; no line ends within a name or between a number and its unit."""
     from markupsafe import Markup, escape
 
-    whole = escape(text).replace("α-order", Markup('<span class="whole">α-order</span>'))
+    whole = escape(_UNIT.sub("\N{NO-BREAK SPACE}", str(text))).replace(
+        "α-order", Markup('<span class="whole">α-order</span>')
+    )
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(whole)))

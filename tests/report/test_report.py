@@ -28,6 +28,11 @@ def test_the_answer_is_the_first_line():
     assert re.sub(r"\s+", " ", text).partition("<main> ")[2].startswith("<h1>It is <code>small</code>.</h1>")
 
 
+def test_no_line_ends_between_a_number_and_its_unit():
+    text = page("It takes 0.068 s a gradient, 9.2 % off at 6 m/s, in 3 steps.", "why", [])
+    assert "0.068\xa0s a gradient, 9.2\xa0% off at 6\xa0m/s, in 3 steps" in text.partition("<h1>")[2]
+
+
 def test_names_are_text_wherever_they_stand():
     table = Table([SCRIPT], [[SCRIPT]], caption=SCRIPT)
     drawn = svg(lambda: figure(SCRIPT), SCRIPT)
