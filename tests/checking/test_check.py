@@ -182,7 +182,7 @@ def measuring():
 class OutOfTime(Mover):
     """Motions that take no time, as many as the number of steps, a line and noise need, and for ever the others."""
 
-    def __init__(self, num_moves=2 + 7 + 2):
+    def __init__(self, num_moves=2 + 6 + 1):
         self.size, self.end = 32, time.perf_counter() + 1000
         self._left = num_moves
 
