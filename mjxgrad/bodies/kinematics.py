@@ -22,7 +22,7 @@ from mjxgrad._mjx import mjx
 from mjxgrad.batched import maps
 from mjxgrad.batched.maps import combine, contract, pick
 from mjxgrad.bodies import mended, spatial, tree
-from mjxgrad.bodies.orientation import orientation
+from mjxgrad.bodies.orientation import Orientations
 
 _Position = Float[Array, " nq"]
 _Vector = Float[Array, " nv"]
@@ -44,7 +44,7 @@ def kinematics(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Place bodies, joints, geoms and sites, and normalise the quaternions of `qpos`; a drop-in for `mjx.kinematics`."""
     frames = tree.frames(model)
     qpos, turn, way, origin = _joint_motion(model, data.qpos)
-    turned = orientation(model, data, frames, turn)
+    turned = Orientations.of(model, data, frames, turn)
     fixed = spatial.rotation_matrix(pick(np.where(frames.is_first, model.jnt_bodyid, -1), model.body_quat, _IDENTITY))
     is_free = (model.jnt_type == _Joint.mjJNT_FREE)[:, None]
     axis = jnp.where(is_free, jnp.asarray(_UP, qpos.dtype), spatial.rotate(fixed, model.jnt_axis))
