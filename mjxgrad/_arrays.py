@@ -3,7 +3,7 @@
 import contextlib
 import inspect
 import operator
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -107,6 +107,18 @@ def function(name: str, value: Any, *arguments: str, is_needed: bool = False) ->
         raise ValueError(f"{wanted}, got {type(value).__name__}: {error}") from None
     except ValueError:  # a function of C without a signature
         return
+
+
+@contextlib.contextmanager
+def traceable(name: str) -> Iterator[None]:
+    """Say what is wrong where a function of the user's leaves JAX, whose own words are of tracers."""
+    errors = jax.errors
+    kinds = (errors.ConcretizationTypeError, errors.TracerArrayConversionError, errors.TracerIntegerConversionError)
+    try:
+        yield
+    except kinds as error:
+        got = "NumPy, float(), int(), .item() or if on traced numbers"
+        raise ValueError(f"{name} must compute with jax.numpy, got {got}; take jnp.where for if") from error
 
 
 def takes(function: Any, name: str) -> bool:

@@ -106,6 +106,24 @@ def identify(measured=five, recordings=None, **how):
 
 
 cart = envs.load("diffrl_cartpole")
+limited = mg.load_scene("<mujoco><worldbody><body><joint name='h'/><geom size='.1'/></body></worldbody>"
+                        "<actuator><motor joint='h' ctrlrange='-1 1'/></actuator></mujoco>", engine="mujoco")
+
+
+class Leaving(planning.Cost):
+    def stage(self, system, state, control):
+        return float(state[0])
+
+    def terminal(self, system, state):
+        return 0.0
+
+
+class Checked(envs.Environment):
+    def observe(self, state, memory):
+        return state.qpos if state.qpos[0] > 0 else -state.qpos
+
+    def rewards(self, before, action, after, memory):
+        return {"a": 1.0}
 
 
 class Rewarded(envs.Environment):
@@ -487,6 +505,30 @@ FOUND = {
     "mg.render.frames(scene, state)": "qpos must be positions, got a state: give its .qpos",
     "mg.render.write_video(np.zeros((2, 4, 4, 3), np.uint8), 'v.mp4')": "path must be the path of a file, got ndarray",
     "mg.render.write_video('v.mp4', np.zeros((2, 4, 4, 5), np.uint8))": "video must have shape (frames, height, width, 3), got",
+    # Functions that leave JAX, numbers that are not real, and what would change nothing.
+    "first(cost=lambda x: float(x[0]))": "function must compute with jax.numpy, got NumPy, float()",
+    "optimise(objective=mg.parameter_noise(lambda x: np.sum(np.asarray(x)), 0.1))": "function must compute with jax.numpy",
+    "optimise(evaluate=lambda x: x[0] if x[0] > 0 else x[1])": "evaluate must compute with jax.numpy",
+    "jax.jit(lambda u: mg.SceneTask(scene, state, lambda t: t.qpos[-1, 0].item(), 2).run(u))(u)":
+        "the task's cost must compute with jax.numpy",
+    "roll(lambda p, s: jnp.array([float(s.qpos[0])]), horizon=2)": "the policy, or observe, must compute with jax.numpy",
+    "jax.jit(lambda k: Checked(scene).reset(k))(key)": "start, observe or rewards must compute with jax.numpy",
+    "planning.Controller(system, Leaving(), np.zeros((3, 2)))": "cost must compute with jax.numpy",
+    "first(cost=lambda x: 1j * x.sum())": "function must return a real number, got complex64",
+    "task(lambda trajectory: 1j * trajectory.qpos[-1, 0])": "the task's cost must return real numbers, got complex64",
+    "mg.learning.Policy.load('no.npz')": "path must be of a policy that save wrote, got no.npz",
+    "optimise(optimiser=optax.adam('1e-2'))": "optimiser must have numbers as its settings, as optax.adam(1e-2); its update",
+    "fit.number(scene, 'body_pos', 'world', column=7)": "column of body_pos must be from 0 to 2, got 7",
+    "scene.with_model(body_mass=jnp.zeros(2))": "body_mass must leave every moving body some mass, got none for body 1",
+    "mg.render.frames(scene, np.zeros((3, 1)), camera='desk')": "there is no camera 'desk'; named cameras are none",
+    "decided(deadline='20ms')": "deadline must be real numbers, got str",
+    "planning.Controller(planning.SceneSystem(balls), planning.GoalCost(jnp.zeros(14), 1, 1, 1), jnp.zeros((3, 0)))":
+        "system must have controls to plan, got none",
+    "warned(optimise, optimiser=optax.adam(jnp.nan))": "no step was taken: its learning rate gives NaN or infinity",
+    "warned(optimise, objective=mg.parameter_noise(lambda x: jnp.nan * x.sum(), 0.1))":
+        "no step was taken: costs or derivatives were NaN or infinite",
+    "warned(mg.rollout, limited, mg.initial_state(limited), [[0.5], [-3.0]])":
+        "a control of actuator 0 is -3 in step 1, and its ctrlrange is -1–1: MuJoCo clamps it",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, instance, one_key, real, whole
+from mjxgrad._arrays import function, instance, one_key, real, traceable, whole
 from mjxgrad.engines import engine_of
 from mjxgrad.engines.engine import Observe
 from mjxgrad.objective.base import as_scalar
@@ -160,6 +160,7 @@ class Environment(InScene):
         """Time between two actions (s)."""
         return self.frame_skip * self.scene.model.opt.timestep
 
+    @traceable("an environment's start, observe or rewards")
     def reset(self, key: PRNGKeyArray) -> EnvState:
         """Begin an episode; the key is consumed, and decides all draws until the next reset."""
         one_key(key)
@@ -188,6 +189,7 @@ class Environment(InScene):
         """Return a state with all that this environment's contact carries, such as the pairs of motions of a slope."""
         return engine_of(self.scene, self.contact).complete(self.scene, physics, self.contact)
 
+    @traceable("an environment's observe, rewards or is_over")
     def step(self, state: EnvState, action: Float[Array, " nu"]) -> EnvState:
         """Apply an action for `frame_skip` time steps; an episode that ended is not reset, see `step_on`.
 

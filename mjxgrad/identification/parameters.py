@@ -259,7 +259,8 @@ def number(scene: Scene, field: str, *names: str, column: int | None = None, bou
     if start not in _OBJECTS or not isinstance(value := getattr(scene.model, field, None), jax.Array):
         raise ValueError(f"field must be one of the model's that begins with {', '.join(_OBJECTS)}, got {field!r}")
     if value.ndim != 1 + (column is not None) or (column is not None and not 0 <= column < value.shape[1]):
-        raise ValueError(f"column of {field} must be one of {value.shape[1:] or 'none'}, got {column}")
+        wanted = f"from 0 to {value.shape[1] - 1}" if value.ndim == 2 else "None, for it has one number each"
+        raise ValueError(f"column of {field} must be {wanted}, got {column}")
     index = np.array([index_of(scene.model, _OBJECTS[start], name) for name in names])
     if start == "dof":
         index = np.flatnonzero(np.isin(scene.model.dof_jntid, index))
@@ -272,19 +273,30 @@ def number(scene: Scene, field: str, *names: str, column: int | None = None, bou
 
 
 def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
-    """Return the two gains of a position actuator, `kp` and `kv`; bounds as in `mass`, each a number or one per gain.
+    """Return the gains of an actuator: `kp` and `kv` of a position servo, `kv` of a velocity servo, the gain of a motor.
+
+    Bounds are as in `mass`, each a number or one per gain.
 
     Raises:
-        ValueError: if there is no such actuator, or a gain is zero and no bounds are given.
+        ValueError: if there is no such actuator, it is of another kind, or a gain is zero and no bounds are given.
     """
     index = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuator)
+    gain, bias = (np.asarray(getattr(scene.model, f"actuator_{name}"))[index] for name in ("gainprm", "biasprm"))
+    has_bias = scene.mj_model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
+    is_position, is_velocity = gain[0] == -bias[1] != 0, gain[0] == -bias[2] and bias[1] == 0
+    places = slice(1, 3) if is_position else slice(2, 3)  # of the bias, where the gains stand once more
+    if has_bias and not (is_position or is_velocity):
+        raise ValueError(
+            f"gains must be of a position or velocity servo or a motor, got {actuator} with bias {bias[:3]}"
+        )
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
         index = index_of(model, _Object.mjOBJ_ACTUATOR, actuator)
-        bias = model.actuator_biasprm.at[index, 1:3].set(-value)
-        return {"actuator_gainprm": model.actuator_gainprm.at[index, 0].set(value[0]), "actuator_biasprm": bias}
+        value = jnp.atleast_1d(value)
+        found = {"actuator_gainprm": model.actuator_gainprm.at[index, 0].set(value[0])}
+        return found | ({"actuator_biasprm": model.actuator_biasprm.at[index, places].set(-value)} if has_bias else {})
 
-    return _positive(-np.asarray(scene.model.actuator_biasprm)[index, 1:3], bounds, write, "", "gains")
+    return _positive(-bias[places] if has_bias else gain[0], bounds, write, "", "gains")
 
 
 def _positive(

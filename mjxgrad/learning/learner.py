@@ -78,7 +78,7 @@ class Policy(eqx.Module):
         """Return the policy that `save` wrote.
 
         Raises:
-            ValueError: if the file holds no policy.
+            ValueError: if there is no such file, or it holds no policy.
         """
         try:
             with np.load(path, allow_pickle=False) as archive:
@@ -88,7 +88,7 @@ class Policy(eqx.Module):
             blank = cls(Network.make(sizes, jax.random.key(0)), Normaliser.make(sizes[0]))
             numbers = [found[name] for name in blank.arrays if name != "scale"]  # in the order of the leaves
             return jax.tree.unflatten(jax.tree.structure(blank), numbers)
-        except (ValueError, KeyError, IndexError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, zipfile.BadZipFile) as error:
             raise ValueError(f"path must be of a policy that save wrote, got {path}") from error
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, one_of, whole
+from mjxgrad._arrays import function, one_of, traceable, whole
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad.estimators.estimate import Reason
 from mjxgrad.loop.result import Best, History, Optimisation, Record, Stopped
@@ -130,7 +131,7 @@ class Descent(Method):
         candidate = Best(at, record.cost, record.scale, record.finite_fraction)
         if (evaluate := options.evaluate) is not None:
             is_due = index % options.evaluate_every == 0
-            cost = lambda x: as_scalar(evaluate(x), "evaluate").astype(x.dtype)  # noqa: E731
+            cost = lambda x: _evaluated(evaluate, x)  # noqa: E731
             record = dataclasses.replace(record, noise_free_cost=jax.lax.cond(is_due, cost, lambda _: nan, at))
             candidate = Best.measured(at, record.noise_free_cost)
         num_in_a_row = jnp.where(record.is_taken, 0, carry.num_in_a_row + 1)
@@ -169,6 +170,12 @@ class Descent(Method):
         at_end = Stopped.interrupted if progress.is_interrupted else Stopped.finished
         at_end = chosen(carry.num_in_a_row >= num_steps, Stopped.not_finite, at_end)
         stopped = chosen(carry.stopped == Stopped.running, at_end, carry.stopped)
+        if np.any(untouched := was_done.any(axis=-1) & ~history.is_taken.any(axis=-1)):
+            is_rule = np.isfinite(history.gradient_norm[untouched]).all()
+            reason = (
+                "its learning rate gives NaN or infinity" if is_rule else "costs or derivatives were NaN or infinite"
+            )
+            warnings.warn(f"optimise has changed nothing, no step was taken: {reason}", stacklevel=2)
         if self.options.evaluate is not None and not progress.is_interrupted:
             final_cost, best = _finish(self.options.evaluate, carry.params, best)
         return Optimisation(
@@ -187,12 +194,18 @@ class Descent(Method):
         )
 
 
+def _evaluated(evaluate: Any, at: Vector) -> Scalar:
+    with traceable("evaluate"):
+        found = evaluate(at)
+    return as_scalar(found, "evaluate").astype(at.dtype)
+
+
 @compiled
 def _finish(evaluate: Any, params: Float[Array, "*seeds dim"], best: Best) -> tuple[Float[Array, "*seeds"], Best]:
     """Measure the last point, of many seeds each; it competes with the best before."""
 
     def finish(at: Vector, best: Best) -> tuple[Scalar, Best]:
-        cost = as_scalar(evaluate(at), "evaluate").astype(at.dtype)
+        cost = _evaluated(evaluate, at)
         return cost, best.against(Best.measured(at, cost))
 
     return (jax.vmap(finish) if params.ndim == 2 else finish)(params, best)

@@ -161,7 +161,11 @@ class GradientStep(Descent):
         gradient = jnp.where(is_finite, gradient, 0).astype(params.dtype)
         # `reduce_on_plateau` needs the cost.
         update = optax.with_extra_args_support(self.optimiser).update
-        updates, moved = update(gradient, inner, params, value=estimate.objective_mean)
+        try:
+            updates, moved = update(gradient, inner, params, value=estimate.objective_mean)
+        except TypeError as error:
+            wanted = "optimiser must have numbers as its settings, as optax.adam(1e-2)"
+            raise ValueError(f"{wanted}; its update raised TypeError: {error}") from error
         change = jnp.asarray(updates)
         is_taken = is_finite & jnp.isfinite(params + change).all()
         moved = jax.tree.map(lambda new, old: jnp.where(is_taken, new, old), moved, inner)

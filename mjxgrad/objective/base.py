@@ -18,7 +18,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function as check_function
-from mjxgrad._arrays import instance, real, whole
+from mjxgrad._arrays import instance, real, traceable, whole
 from mjxgrad.objective.task import as_pytree
 
 Scalar = Float[Array, ""]
@@ -158,7 +158,7 @@ def check_vector(shape: tuple[int, ...], dtype: jnp.dtype) -> None:
         raise ValueError("params must have at least one number, got none")
 
 
-def unchanged(vector: Vector) -> Vector:
+def unchanged(vector: Float[Array, "*seeds dim"]) -> Float[Array, "*seeds dim"]:
     """Return the vector unchanged: the pull-back where the noise is on the parameters."""
     return vector
 
@@ -176,6 +176,8 @@ def as_scalar(value: Any, name: str) -> Scalar:
         raise ValueError(f"{name} must return one number, got {type(value).__name__}")
     if jnp.shape(value) != ():
         raise ValueError(f"{name} must return a scalar of shape (), got shape {jnp.shape(value)}")
+    if jnp.iscomplexobj(value):
+        raise ValueError(f"{name} must return a real number, got {jnp.result_type(value)}")
     return jnp.asarray(value, jnp.result_type(value, float))
 
 
@@ -185,7 +187,8 @@ def value_and_gradient(
     """Differentiate as `jax.value_and_grad` does, in forward mode up to three dimensions if the function has one."""
 
     def both(at: Vector) -> tuple[Scalar, Any]:
-        found = function(at)
+        with traceable("function"):
+            found = function(at)
         value = as_scalar(found[0] if has_aux else found, "function")
         return value, (value, found[1]) if has_aux else value
 
@@ -221,7 +224,9 @@ class ParameterNoise(Objective):
         return gaussian(key, self.stddev, self.noise_shape)
 
     def value(self, params: Vector, noise: Vector) -> Scalar:
-        return as_scalar(self.function(params + noise.astype(params.dtype)), "function")
+        with traceable("function"):
+            found = self.function(params + noise.astype(params.dtype))
+        return as_scalar(found, "function")
 
     def score(self, params: Vector, noise: Vector) -> Vector:
         return (noise / self.stddev**2).astype(params.dtype)

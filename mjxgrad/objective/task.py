@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import form, function, one_of, whole
+from mjxgrad._arrays import form, function, one_of, traceable, whole
 from mjxgrad.contact import Softness
 from mjxgrad.engines.state import check_scene
 from mjxgrad.rollouts import Observe, PolicyFunction, Sees, State, Trajectory, rollout
@@ -162,7 +162,9 @@ class SceneTask(Task, InScene):
             qpos, qvel, act = (x[:-1] for x in (trajectory.qpos, trajectory.qvel, jnp.asarray(trajectory.act)))
             time = start.time + self.scene.model.opt.timestep * jnp.arange(self.horizon)
             states = jax.vmap(State)(qpos, qvel, act, time, jnp.zeros_like(qvel))
-        charged = finite_cost(checked_cost(self.cost(trajectory), self.horizon), trajectory)
+        with traceable("the task's cost"):
+            cost = self.cost(trajectory)
+        charged = finite_cost(checked_cost(cost, self.horizon), trajectory)
         return Outcome(charged.sum(), states, charged if charged.ndim else None)
 
 
@@ -171,6 +173,8 @@ def checked_cost(cost: Any, horizon: int) -> Float[Array, "*steps"]:
     if not eqx.is_array_like(cost) or jnp.shape(cost) not in ((), (horizon + 1,)):
         wanted = f"a scalar of shape () or one number per state, shape ({horizon + 1},)"
         raise ValueError(f"the task's cost must return {wanted}, got {form(cost)}")
+    if jnp.iscomplexobj(cost):
+        raise ValueError(f"the task's cost must return real numbers, got {jnp.result_type(cost)}")
     return jnp.asarray(cost, jnp.result_type(cost, float))
 
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import whole
+from mjxgrad._arrays import real, traceable, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Exact, Smoother
 from mjxgrad.planning.system import Cost, System
@@ -83,7 +83,7 @@ class Controller(Printed):
         Raises:
             ValueError: if a number is out of its range, and as `optimise_trajectory`.
         """
-        if deadline is not None and not deadline > 0:
+        if deadline is not None and not real("deadline", deadline) > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
         self.num_samples = whole("num_samples", num_samples, 0)
         both = [np.asarray(one) for one in (schedule if first_schedule is None else first_schedule, schedule)]
@@ -115,7 +115,8 @@ class Controller(Printed):
         )
         self._still = np.zeros_like(self._noise(0))
         given = numbers, self._blank, number, number, np.int32(0), np.bool_(True), self._still
-        lowered = [jax.jit(part).lower(*given) for part in parts]
+        with traceable("cost"):
+            lowered = [jax.jit(part).lower(*given) for part in parts]
         with ThreadPoolExecutor(len(PARTS)) as threads:
             self._programs: dict[str, Any] = dict(
                 zip(PARTS, threads.map(lambda one: one.compile(), lowered), strict=True)

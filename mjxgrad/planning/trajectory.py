@@ -270,6 +270,8 @@ def posed(
     A start of None is the system's origin.
     """
     instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
+    if not system.num_controls:
+        raise ValueError("system must have controls to plan, got none: give the scene actuators")
     instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
     instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
     start = system.origin if start is None else jnp.asarray(start)

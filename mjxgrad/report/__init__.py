@@ -20,7 +20,7 @@ _GREY = 40  # largest difference of a grey's colour components, of 255
 _IMAGES = "<style>@media (prefers-color-scheme: dark) { image { filter: invert(1) hue-rotate(180deg) } }</style>"
 # A figure opened by itself has no page colours.
 _ALONE = f"color-scheme: light dark; color: {INK}; color: light-dark({INK}, #e7eaef)"
-_UNIT = re.compile(r"(?<=\d) (?=(?:%|[smNh]|[mµ]s|mm|min|rad|Hz|kg|1/s²?|m/s²?|rad/s)(?![\w/]))")
+_UNIT = re.compile(r"(?<=[\d²³⁰-⁹]) (?=(?:%|[smNh]|[mµ]s|mm|min|rad|Hz|kg|1/s²?|m/s²?|rad/s)(?![\w/]))")
 _XMLNS = ' xmlns="http://www.w3.org/2000/svg"'
 
 

@@ -19,6 +19,7 @@ from mjxgrad._arrays import instance, positive, real, whole
 from mjxgrad._text import write
 from mjxgrad.batched.device import fits
 from mjxgrad.scene import Scene
+from mjxgrad.stepping.rows import index_of
 
 Number = int | float
 # (frames, height, width, 3)
@@ -70,6 +71,8 @@ def frames(
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
     positions = np.asarray(real("qpos", qpos), dtype=np.float64)
     _check(mj_model, positions, timestep=timestep, fps=fps, speed=speed, height=height, width=width)
+    if isinstance(camera, str):
+        index_of(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)  # refuses an unknown one
     mj_model = copy.copy(mj_model)
     mj_model.vis.global_.offheight = max(height, mj_model.vis.global_.offheight)
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)

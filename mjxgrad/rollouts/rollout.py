@@ -2,23 +2,27 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import function, instance, known, real, whole
+from mjxgrad._arrays import function, instance, known, real, traceable, whole
 from mjxgrad._programs import compiled
+from mjxgrad._text import format_number, format_range
 from mjxgrad.batched.device import copies, fits
 from mjxgrad.engines import Motion, Observe, PolicyFunction, Rows, Sees, State, Trajectory, engine_of
 from mjxgrad.engines.layout import INPUTS
 from mjxgrad.engines.state import check_scene, direction
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact, Discrete, Slope, Smoothing, smoothing_warnings
+
+_ROUNDING = 1e-6  # of the ends of a range, by which single precision may pass them
 
 
 def rollout(
@@ -92,7 +96,10 @@ def rollout(
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     rows = Rows(base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     motion = Motion(scene, policy, params if policy is not None else None, observe, policy_sees, checkpoint, contact)
-    found = engine.roll_out(motion, state, rows)
+    for message in () if sequence is None else _clamped(scene, sequence):
+        warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
+    with traceable("the policy, or observe,"):
+        found = engine.roll_out(motion, state, rows)
     if not measure_growth:
         return found
     alone = Motion(scene, None, None, None, "state", checkpoint, contact)
@@ -149,6 +156,22 @@ def linearise(
     ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
     sequence_of(ctrl[None], None, 1, scene.model.nu)
     return Linearisation(*engine_of(scene, contact).linearise(scene, state, ctrl, contact))
+
+
+def _clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str]:
+    """Yield that controls leave their actuator's range, if they are known and do."""
+    model, numbers, ends = scene.mj_model, known(controls), known(scene.model.actuator_ctrlrange)
+    if numbers is None or ends is None or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        return
+    low, high = (ends + _ROUNDING * np.abs(ends) * np.array([-1.0, 1.0])).T
+    beyond = ((numbers < low) | (numbers > high)) & (model.actuator_ctrllimited == 1)
+    if beyond.any():
+        row, column = np.argwhere(beyond)[0].tolist()
+        name = model.actuator(column).name or column
+        reach = (
+            f"{format_number(numbers[row, column])} in step {row}, and its ctrlrange is {format_range(ends[column])}"
+        )
+        yield f"a control of actuator {name} is {reach}: MuJoCo clamps it, and it has no derivative there"
 
 
 def sequence_of(

@@ -155,6 +155,8 @@ class Scene(eqx.Module):
             if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
                 raise ValueError(f"{name} must {requirement}, got {least:g}")
+        if "body_mass" in known and (empty := _without_mass(self.mj_model, known["body_mass"])):
+            raise ValueError(f"body_mass must leave every moving body some mass, got none for {empty}")
         if "wind" in fields and not has_medium(self.mj_model):
             _warn(self, "wind acts on nothing without a medium: set density or viscosity in <option>")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
@@ -233,6 +235,15 @@ class Scene(eqx.Module):
 def _warn(scene: Scene, message: str) -> None:
     """Warn the caller of a scene's method; Equinox wraps methods, so this is one stack level further up."""
     warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
+
+
+def _without_mass(model: mujoco.MjModel, mass: np.ndarray) -> str:
+    """Return the first body with joints that has no mass, nor has any that it carries, though the file's has; or nothing."""
+    carried = mass.astype(float)
+    for body in range(model.nbody - 1, 0, -1):
+        carried[model.body_parentid[body]] += carried[body]
+    empty = np.flatnonzero((model.body_jntnum > 0) & (carried == 0) & (model.body_subtreemass > 0))
+    return (model.body(empty[0]).name or f"body {empty[0]}") if empty.size else ""
 
 
 def numbers_of(model: mjx.Model) -> dict[str, Array]:

@@ -225,11 +225,11 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     return total
 
 
-def index_of(model: mjx.Model, kind: mujoco.mjtObj, name: str) -> int:
-    """Return the index of a named body, joint, geom, site, sensor or actuator; refuse an unknown name."""
+def index_of(model: mjx.Model | mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    """Return the index of a named body, joint, geom, site, sensor, actuator or camera; refuse an unknown name."""
     instance("model", model, mjx.Model | mujoco.MjModel, "MJX's, as scene.model")
     word = kind.name.removeprefix("mjOBJ_").lower()
-    count = {"joint": "njnt", "actuator": "nu"}.get(word, f"n{word}")
+    count = {"joint": "njnt", "actuator": "nu", "camera": "ncam"}.get(word, f"n{word}")
     names = [mjx.id2name(model, kind, index) for index in range(getattr(model, count))]
     if name not in names:
         listed = ", ".join(repr(one) for one in names if one) or "none"

@@ -156,7 +156,7 @@ def test_parameters_are_named_in_a_word(scene):
         "mass": "must say of what",
         "gear:no": "no",
         "mass:cart=-1..1": "negative",
-        "body_pos:cart": "column of body_pos must be one of",
+        "body_pos:cart": "column of body_pos must be from 0 to 2, got None",
         "opt.timestep": "kind one of mass",
     }
     for wrong, said in refused.items():

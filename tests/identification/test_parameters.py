@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -94,6 +95,33 @@ def _random_body(seed):
     weights = rng.uniform(0.1, 1, 12)
     homogeneous = np.column_stack([points, np.ones(12)])
     return homogeneous.T @ (weights[:, None] * homogeneous), points, weights
+
+
+@pytest.mark.parametrize(
+    ("kind", "gain"), [('velocity kv="5"', 5.0), ('motor gear="2"', 1.0), ('general gainprm="3"', 3.0)]
+)
+def test_the_gain_of_an_actuator_that_is_no_position_servo_is_where_the_file_has_it(kind, gain):
+    """MuJoCo's own compiler says where twice the gain stands."""
+    file = f"""<mujoco><worldbody><body><joint name="j"/><geom size=".1" pos=".1 0 0"/></body></worldbody>
+        <actuator><{kind} name="a" joint="j"/></actuator></mujoco>"""
+    scene = mg.load_scene(file, keep_everything=True)
+    parameter = identification.gains(scene, "a")
+    np.testing.assert_allclose(np.ravel(parameter.nominal), [gain])
+    found = scene.with_model(**parameter.write(scene.model, jnp.asarray(2 * parameter.nominal))).model
+    twice = f'kv="{2 * gain}"' if "kv" in kind else f'gainprm="{2 * gain}"'
+    asked = file.replace('kv="5"', twice).replace('gainprm="3"', twice).replace("motor", f"general {twice}")
+    expected = mujoco.MjModel.from_xml_string(asked)
+    np.testing.assert_allclose(found.actuator_gainprm, expected.actuator_gainprm)
+    np.testing.assert_allclose(found.actuator_biasprm, expected.actuator_biasprm)
+
+
+def test_gains_of_what_is_no_servo_are_refused():
+    scene = mg.load_scene(
+        """<mujoco><worldbody><body><joint name="j"/><geom size=".1" pos=".1 0 0"/></body></worldbody><actuator>
+        <general name="a" joint="j" gainprm="3" biastype="affine" biasprm="1 -2 -3"/></actuator></mujoco>"""
+    )
+    with pytest.raises(ValueError, match="gains must be of a position or velocity servo or a motor"):
+        identification.gains(scene, "a")
 
 
 def test_a_pseudo_inertia_comes_back_from_its_ten_numbers_and_from_mujocos_fields():
