@@ -69,19 +69,24 @@ class MJX:
             scene.model, forward(scene.model, data_of(scene, state, ctrl).replace(**inputs), contact=contact)
         )
 
+    def after(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact) -> Any:
+        """Return the motion one step later, and the readings of sensors."""
+        return step(scene.model, data_of(scene, state, ctrl), contact=contact)
+
     def linearise(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
     ) -> tuple[Array, Array, Array, Array]:
         nv, size = scene.model.nv, 2 * scene.model.nv + scene.model.na
-        end = step(scene.model, data_of(scene, state, ctrl), contact=contact)
+        end = self.after(scene, state, ctrl, contact)
 
         def moved(change: Float[Array, " both"]) -> tuple[Array, Array]:
-            data = data_of(scene, state, ctrl + change[size:]).replace(
+            start = dataclasses.replace(
+                state,
                 qpos=integrate_position(scene.model, state.qpos, change[:nv], 1.0),
                 qvel=state.qvel + change[nv : 2 * nv],
                 act=state.act + change[2 * nv : size],
             )
-            found = step(scene.model, data, contact=contact)
+            found = self.after(scene, start, ctrl + change[size:], contact)
             change = position_change(scene.model, end.qpos, found.qpos)
             return jnp.concatenate([change, found.qvel, found.act]), found.sensordata
 

@@ -18,7 +18,7 @@ from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows
 from mjxgrad.engines.mjx import MJX, Moving, Scan, roll_out
 from mjxgrad.engines.mujoco import observed
 from mjxgrad.engines.state import State, Trajectory, state_of
-from mjxgrad.engines.worlds import GIVEN, INPUTS, MOTION, NUMBER, Values, Worlds, worlds_of
+from mjxgrad.engines.worlds import GIVEN, INPUTS, NUMBER, Values, Worlds, worlds_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Contact, Discrete, Slope, pairs
@@ -43,22 +43,19 @@ class Warp(MJX):
     def look(
         self, scene: Scene, state: State, ctrl: Float[Array, " nu"], inputs: Inputs, observe: Observe, contact: Contact
     ) -> PyTree:
-        readings = _worlds(scene).step(_values(scene, _world(scene, state, ctrl, inputs)))["sensordata"]
+        readings = _Program(scene, _world(scene, state, ctrl, inputs)).found().sensordata
         return observed(scene, state, ctrl, inputs, readings, observe)
 
-    def linearise(
-        self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact
-    ) -> tuple[Array, Array, Array, Array]:
-        given = _values(scene, _world(scene, state, ctrl, {}))
-        matrix = _worlds(scene).derivative(given, tuple(name for name in (*MOTION, "ctrl") if given[name].size))
-        size = 2 * scene.model.nv + scene.model.na
-        A, C = jnp.split(matrix[:, :size], [size])
-        B, D = jnp.split(matrix[:, size:], [size])
-        return A, B, C, D
+    def after(self, scene: Scene, state: State, ctrl: Float[Array, " nu"], contact: Contact) -> "World":
+        program = _Program(scene, _world(scene, state, ctrl, {}))
+        if isinstance(contact, Discrete):
+            return program.found()
+        moved, flight = pairs.follow(program, pairs.no_flight(scene.model, scene.data))
+        return pairs.put(moved, pairs.whole(scene.model, pairs.taken(moved), flight))
 
 
 class World(eqx.Module):
-    """What a step is given, and what it finds; or, of each of these, whether it has a derivative."""
+    """All that a step takes and finds; or, of each of these, whether it has a derivative."""
 
     qpos: Any
     qvel: Any
@@ -84,7 +81,7 @@ class _Scan(Scan):
         inputs = {name: getattr(data, name) for name in INPUTS}
         program, flight = _Program(self.scene, _world(self.scene, state_of(data), data.ctrl, inputs)), moving.flight
         if flight is None:
-            found = program.advance(*program.all_of(program.given))
+            found = program.found()
         else:
             found, flight = pairs.follow(program, flight)
         return found, Moving(State(found.qpos, found.qvel, found.act, found.time, found.qacc_warmstart), flight)
@@ -106,6 +103,10 @@ class _Program(pairs.Program):
     def __init__(self, scene: Scene, world: World):
         self._scene = scene
         super().__init__(scene.model, world, is_single=True)
+
+    def found(self) -> World:
+        """Return what a step finds."""
+        return self.advance(*self.all_of(self.given))
 
     def advance(self, model: mjx.Model, data: World) -> World:
         scene = dataclasses.replace(self._scene, model=model)

@@ -24,8 +24,8 @@ from mjxgrad.scene import SceneError
 from mjxgrad.stepping import pairs, slope
 
 _POSITION, _OTHER = 3e-5, 1e-3  # widths of differences (m or rad; m/s, rad/s or the unit of an input)
-_CLEAR = 1.5  # times what differences of positions move a gap, from which they cross no surface
-_LOOSE = 1e-3  # of the squared rows of surfaces that are cleared: they may depend on each other
+_CLEAR = 0.8  # of the way to a surface, which differences of positions may go
+_LEAST = 2e-6  # of their widths; rounding is 3 % of such a difference
 _AT_ONCE = 2**32  # bytes of the worlds that are stepped in one call
 _ROOM = 48  # contacts of a world, unless `max_contacts` says
 _TILE = 64  # Warp reads rows in blocks of so many, beyond the end if they do not fit
@@ -54,24 +54,30 @@ class Worlds:
         self._rows = -(-self._rows // _TILE) * _TILE
         has_limits = mj_model.jnt_limited.any() or mj_model.tendon_limited.any()
         self.has_surfaces = bool(has_limits or mj_model.nflex or mj_model.npair or (mj_model.geom_contype > 0).any())
+        self._far = copy.deepcopy(mj_model)  # whose rows are wanted, in full, and not the solution
+        self._far.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        self._far.opt.iterations = self._far.opt.ls_iterations = 1
         try:
             self._model = _put(mj_model)
-            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(1)) if eqx.is_array(x))
+            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(mj_model, 1)) if eqx.is_array(x))
         except (NotImplementedError, RuntimeError) as error:
             raise SceneError(f"MuJoCo Warp cannot step it: {error}") from error
-        self._run, self._run_near = self._of_many(self._after), self._of_many(self._surfaces)
+        self._run = self._of_many(mj_model, self._after)
+        self._run_near = self._of_many(self._far, self._surfaces)
         self.step = jax.custom_jvp(self._step)
         self.step.defjvp(self._derived, symbolic_zeros=True)
 
-    def _data(self, count: int) -> mjx.Data:
+    def _data(self, mj_model: mujoco.MjModel, count: int) -> mjx.Data:
         with jax.ensure_compile_time_eval():
-            return mjx.make_data(self.mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
+            return mjx.make_data(mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
 
-    def _of_many(self, function: Callable[[mjx.Data, Values, Values], Values]) -> Callable[[Values], Values]:
+    def _of_many(
+        self, mj_model: mujoco.MjModel, function: Callable[[mjx.Data, Values], Values]
+    ) -> Callable[[Values], Values]:
         """Return a function of many worlds, which are the leading axis of all."""
 
-        # One call of Warp takes all of a batch, as far as memory goes. The function takes Warp's data, what of it is given, and
-        # numbers of the model, of one world.
+        # One call of Warp takes all of a batch, as far as memory goes. The function takes data of one world, and
+        # numbers of its model.
         @custom_vmap
         def run(given: Values) -> Values:
             count = len(given["qpos"])
@@ -85,11 +91,11 @@ class Worlds:
                 }
                 found = jax.lax.map(run, {k: x.reshape(num, each, *x.shape[1:]) for k, x in padded.items()})
                 return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
-            data = self._data(count)
+            data = self._data(mj_model, count)
 
             def one(given: Values) -> Values:
                 numbers = {k.removeprefix(NUMBER): x for k, x in given.items() if k.startswith(NUMBER)}
-                return function(data.replace(**{k: x for k, x in given.items() if k in GIVEN}), given, numbers)
+                return function(data.replace(**{k: x for k, x in given.items() if k in GIVEN}), numbers)
 
             found = jax.vmap(one)({k: x.astype(jnp.float32) for k, x in given.items()})
             dtype = given["qpos"].dtype
@@ -105,24 +111,20 @@ class Worlds:
 
         return run
 
-    def _after(self, data: mjx.Data, given: Values, numbers: Values) -> Values:
+    def _after(self, data: mjx.Data, numbers: Values) -> Values:
         after = mjx.step(self._model.tree_replace(numbers) if numbers else self._model, data)
         found = {k: getattr(after, k) for k in (*MOTION, "time", "qacc_warmstart", "sensordata")}
         return found | {"overflow": after._impl.overflow.reshape(())}
 
     @functools.cached_property
-    def _far(self) -> mjx.Model:
-        """The model whose rows are wanted, and not the solution."""
-        model = copy.deepcopy(self.mj_model)
-        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        model.opt.iterations = model.opt.ls_iterations = 1
-        return _put(model)
+    def _far_model(self) -> mjx.Model:
+        return _put(self._far)
 
     @functools.cached_property
     def _levers(self) -> Float[np.ndarray, "nbody nv"]:
         return events.levers_of(self.mj_model)
 
-    def _surfaces(self, data: mjx.Data, given: Values, numbers: Values) -> Values:
+    def _surfaces(self, data: mjx.Data, numbers: Values) -> Values:
         """Return the nearest contacts and limits of a world."""
         model = self.mj_model
         # As `events.Surfaces` does: margins are larger by what a state travels in half a step, at most.
@@ -134,7 +136,7 @@ class Worlds:
         more = {"geom_margin": contact / 2, "pair_margin": contact, "jnt_margin": limit, "tendon_margin": limit}
         margins = {k: numbers.get(k, jnp.asarray(getattr(model, k))) + x for k, x in more.items()}
         margins = {k: x.astype(jnp.float32) for k, x in margins.items()}
-        found = mjx.forward(self._far.tree_replace(numbers | margins), data)
+        found = mjx.forward(self._far_model.tree_replace(numbers | margins), data)
         rows, kind, index = found._impl.efc__J[:, : model.nv], found._impl.efc__type, found._impl.efc__id
         is_contact, is_joint = kind >= _CONTACT, kind == _JOINT
         is_first = jnp.concatenate([jnp.ones(1, bool), (index[1:] != index[:-1]) | ~is_contact[:-1]])
@@ -181,7 +183,11 @@ class Worlds:
         if not names:
             return found, zeros
         parts = [self._to_tangent(given[k], changes[k]) if k == "qpos" else changes[k].reshape(-1) for k in names]
-        moved = jnp.matmul(self.derivative(given, names), jnp.concatenate(parts), precision="highest")
+        moved = jnp.matmul(
+            self.derivative(given | {"qacc_warmstart": found["qacc_warmstart"]}, names),
+            jnp.concatenate(parts),
+            precision="highest",
+        )
         sizes = [self.mj_model.nv, self.mj_model.nv, self.mj_model.na]
         qpos, qvel, act, sensed = jnp.split(moved, np.cumsum(sizes))
         return found, zeros | {
@@ -190,14 +196,13 @@ class Worlds:
 
     def derivative(self, given: Values, names: tuple[str, ...]) -> Float[Array, "outputs columns"]:
         """Return the derivative of the next state, in tangent space, and of readings by what is given, by central differences."""
+        # From the solution of the step itself the solver takes one or two iterations.
         dtype, points, widths = given["qpos"].dtype, [], []
         given = {k: jax.lax.stop_gradient(x).astype(jnp.float32) for k, x in given.items()}  # so that widths are Warp's
-        if self.has_surfaces:
-            given = given | {"qpos": self._beside(given)}
         for name in names:
             size = self.mj_model.nv if name == "qpos" else given[name].size
-            away = (_POSITION if name == "qpos" else _OTHER) * jnp.eye(size, dtype=jnp.float32)
-            ends = [self._moved(given, name, sign * away) for sign in (1.0, -1.0)]
+            away = self._reach(given) if name == "qpos" else jnp.array([[_OTHER], [-_OTHER]])
+            ends = [self._moved(given, name, one[:, None] * jnp.eye(size, dtype=jnp.float32)) for one in away]
             widths.append(self._apart(name, ends[0], ends[1]))
             points += [
                 {k: jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()} | {name: end} for end in ends
@@ -212,17 +217,22 @@ class Worlds:
             columns.append(jnp.concatenate(apart, axis=1) / width[:, None])
         return jnp.concatenate(columns).T.astype(dtype)
 
-    def _beside(self, given: Values) -> Float[Array, " nq"]:
-        """Return the position moved to where differences cross no surface: contact and limits begin with a jump."""
+    def _reach(self, given: Values) -> Float[Array, "2 #nv"]:
+        """Return the ends of differences of positions: as far to both sides, or to one, where the other crosses a surface."""
+        # Contacts and limits begin with a jump.
+        if not self.has_surfaces:
+            return jnp.array([[_POSITION], [-_POSITION]])
         near = self.near(given)
-        least = _CLEAR * _POSITION * jnp.max(jnp.abs(near.rows), axis=1)
-        is_close = jnp.abs(near.gaps) < least
-        shift = jnp.where(is_close, jnp.where(near.gaps < 0, -least, least) - near.gaps, 0.0)
-        rows = jnp.where(is_close[:, None], near.rows, 0.0)
-        square = jnp.matmul(rows, rows.T, precision="highest")
-        square += jnp.diag(jnp.where(is_close, _LOOSE * jnp.diag(square), 1.0))
-        change = jnp.matmul(jax.scipy.linalg.solve(square, shift, assume_a="pos"), rows, precision="highest")
-        return self._moved(given, "qpos", change[None])[0]
+        rates = near.rows.T
+        moves = jnp.abs(rates) > 0
+        steps = -near.gaps / jnp.where(moves, rates, 1.0)  # to each surface
+        ahead = jnp.min(jnp.where(moves & (steps >= 0), steps, jnp.inf), axis=1)
+        behind = jnp.min(jnp.where(moves & (steps < 0), -steps, jnp.inf), axis=1)
+        ahead, behind = (jnp.clip(_CLEAR * x, _LEAST, _POSITION) for x in (ahead, behind))
+        is_free = (ahead == _POSITION) & (behind == _POSITION)
+        return jnp.stack(
+            [jnp.where(is_free | (ahead >= behind), ahead, 0), -jnp.where(is_free | (ahead < behind), behind, 0)]
+        )
 
     def _moved(self, given: Values, name: str, changes: Float[Array, "columns size"]) -> Array:
         if name != "qpos":

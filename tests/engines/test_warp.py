@@ -1,6 +1,8 @@
 """MuJoCo Warp against C MuJoCo: motion, derivatives of steps and of rollouts, batches, room; `make test-warp` installs it."""
 
+import functools
 import importlib.util
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +66,8 @@ def test_gradients_of_rollouts_agree_in_batches_and_in_parts(monkeypatch):
     for most in (2**32, 1):  # bytes: one world at a time
         monkeypatch.setattr(worlds, "_AT_ONCE", most)
         for ours, theirs in zip(gradients(scene), expected, strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=5e-3, atol=5e-3 * float(jnp.abs(theirs).max()))
+            # The ball begins on the floor, so differences are to one side, and of those rounding is half a percent.
+            np.testing.assert_allclose(ours, theirs, rtol=5e-3, atol=1e-2 * float(jnp.abs(theirs).max()))
 
 
 def test_forward_mode_is_reverse_mode():
@@ -101,6 +104,20 @@ def test_contacts_without_room_are_counted():
     assert counts == [5, 0]
 
 
+def test_differences_cross_no_surface():
+    beam = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .1">
+        <joint type="slide" axis="0 0 1"/>
+        <joint axis="0 1 0"/><geom type="capsule" fromto="-.2 0 0 .2 0 0" size=".1" mass="1"/></body></worldbody>
+        </mujoco>"""
+    scene = mg.load_scene(beam, engine="warp")
+    linearise = lambda scene, state, contact: mg.linearise(scene, state, np.zeros(0), contact=contact).A  # noqa: E731
+    # Of differences of 3e-5 one end, or both, would be on the other side.
+    for height, contact in itertools.product((1e-5, 1e-6, -1e-6, -1e-5), (mg.Discrete(), mg.Slope())):
+        state = mg.initial_state(scene, qpos=np.array([height, 0.0]), qvel=np.array([-0.5, 0.1]))
+        found, expected = (linearise(one, state, contact) for one in (scene, scene.with_engine("mujoco")))
+        np.testing.assert_allclose(found, expected, atol=0.03 * np.abs(expected).max())  # rounding over 2e-6
+
+
 def test_the_slope_is_c_mujocos():
     ball = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .12"><freejoint/>
         <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
@@ -111,9 +128,8 @@ def test_the_slope_is_c_mujocos():
         return course.qpos[-1, 0] + course.qvel[-1, 2]
 
     scene = mg.load_scene(ball, engine="warp")
-    found, expected = (
-        jax.jit(jax.vmap(jax.grad(lambda v: cost(one, v))))(speeds) for one in (scene, scene.with_engine("mujoco"))
-    )
+    slopes = lambda scene: jax.jit(jax.vmap(jax.grad(functools.partial(cost, scene))))(speeds)  # noqa: E731
+    found, expected = slopes(scene), slopes(scene.with_engine("mujoco"))
     # Rounding is 0.4 % of a difference, and what friction changes here is 0.3; without events it is off by 0.05.
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
