@@ -334,12 +334,16 @@ def sweep(
 
     what = f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each"
     by = engine_of(scene, task.contact)
-    if by is ENGINES[QUICK] and task.num_controls:
+    first = "compiling first"
+    if task.num_controls:
         price = {kind: task.horizon * seconds for kind, seconds in seconds_of(scene).items()}
         one = price[getattr(task.contact, "gradient", "slope")]
-        seconds = len(swept) * (num_samples * one + num_reference * price["motion"])
-        what += f": {duration(seconds)}, {BATCH * one:.2g} s a gradient"
-    say(f"{what}, by {by.title}; compiling first")
+        whole_price = duration(len(swept) * (num_samples * one + num_reference * price["motion"]))
+        if by is ENGINES[QUICK]:
+            what += f": {whole_price}, {BATCH * one:.2g} s a gradient"
+        else:  # nobody knows before how long that takes
+            first += f", a minute or several for a robot; engine mujoco would take {whole_price}, and compiles nothing"
+    say(f"{what}, by {by.title}; {first}")
     result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=progress, **given)
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2

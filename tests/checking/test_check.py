@@ -26,11 +26,13 @@ from mjxgrad.checking.motions import (
     most_contacts,
     random_motions,
     run,
+    seconds_of,
     start_of,
 )
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.diagnostics.jumps import Jumps
 from mjxgrad.diagnostics.slope import compare_to_slope, phases
+from mjxgrad.engines.pool import Pool
 from mjxgrad.scene.load import count_pairs
 from tests.scenes import ASSETS
 
@@ -101,12 +103,26 @@ def test_an_actuator_without_effect_is_named_and_no_other():
     assert not kinds(quick(ball(gear=1)))
 
 
+def test_a_price_is_that_of_a_rollouts_gradient(monkeypatch):
+    """Plans have cheaper ones, which follow no pairs and give a motion's end alone."""
+    own, asked = Pool.maps, set()
+
+    def maps(self, *given, gradient, wanted):
+        asked.add((gradient, "apart" in wanted))
+        return own(self, *given, gradient=gradient, wanted=wanted)
+
+    monkeypatch.setattr(Pool, "maps", maps)
+    prices = seconds_of(mg.load_scene(ball(), engine="mujoco"))
+    assert asked == {("slope", True), ("discrete", False)}
+    assert 0 < prices["motion"] < prices["discrete"]
+
+
 @pytest.mark.parametrize(("reach", "expected"), [("-90 90", {"degrees"}), ("-1.5 1.5", set()), ("-9 9", set())])
 def test_a_control_range_in_degrees_is_named(reach, expected):
     """MuJoCo turns a joint's range into rad, and no control range; a servo that turns further than its joint is no mistake."""
     scene = mg.load_scene(
         f"""<mujoco><worldbody><body><joint name="j" range="-90 90"/><geom type="capsule" fromto="0 0 0 .3 0 0"
-        size=".02"/></body></worldbody><actuator><position name="servo" joint="j" kp="1" ctrlrange="{reach}"/></actuator></mujoco>"""
+        size=".02"/></body></worldbody><actuator><position name="servo" joint="j" ctrlrange="{reach}"/></actuator></mujoco>"""
     )
     assert kinds(quick(scene)) & {"degrees"} == expected
 
