@@ -210,7 +210,7 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
         <geom size=".1"/></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>""")
     controls = np.cos(np.arange(30) / 4)[:, None]
     start = mg.initial_state(scene, qvel=jnp.array([1.0, 0, 2, 3, -2, 1, 0.5]))
-    course = jax.jit(lambda: mg.rollout(scene, start, controls))()
+    course = jax.jit(lambda: mg.rollout(scene.with_engine("mujoco"), start, controls))()
     qpos = np.array(course.qpos)
     qpos[20:, 3:7] *= -1  # the same turn
     turned = qpos.copy()
@@ -221,13 +221,15 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     whole = Recording({"qpos": turned, "qvel": course.qvel}, controls, noise=noise, start=start)
     windows = stack(scene, whole.cut(0.08, 0.01))
     assert windows.controls.shape == (3, 8, 1)
-    # By C MuJoCo and by MJX.
-    for contact in (None, mg.Onset()):
-        motions = Motions(scene, {"none": Parameter(1.0)}, delay=None, contact=contact)
+    by_mujoco, by_mjx = (
+        Motions(scene, {"none": Parameter(1.0)}, delay=None, contact=contact) for contact in (None, mg.Onset())
+    )
+    for motions in (by_mujoco, by_mjx):
         found = motions.residuals(windows, np.ones((1, 1)), np.zeros((1, 3, 14))).reshape(3, 9, 14)[..., :7]
         assert np.abs(found).max() < 1e-7
-        whole_found = motions.residuals(stack(scene, [whole]), np.ones((1, 1)), np.zeros((1, 1, 14))).reshape(31, 14)
-        np.testing.assert_allclose(whole_found[25, :7], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
+    # The angle of a turn is taken by one function, whoever moves the body.
+    found = by_mujoco.residuals(stack(scene, [whole]), np.ones((1, 1)), np.zeros((1, 1, 14))).reshape(31, 14)
+    np.testing.assert_allclose(found[25, :7], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
 
 
 def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):

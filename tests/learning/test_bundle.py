@@ -92,6 +92,7 @@ def test_a_foot_that_lands_within_the_step_counts(ball):
     assert not np.allclose(at(ball, BUNDLE, 4e-3, -3.0)[0], at(ball, None, 4e-3, -3.0)[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_without_spread_it_is_the_plain_one(ball):
     bundle = Bundle(num_branches=3, position_stddev=0.0, velocity_stddev=0.0, force=0.0)
     assert_allclose(at(ball, bundle, DEEP, -0.1)[0], at(ball, None, DEEP, -0.1)[0], rtol=1e-10)
