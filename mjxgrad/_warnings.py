@@ -6,10 +6,12 @@ It has one handler for all threads. A thread that took the handler away while an
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import mujoco
 
+_Found = TypeVar("_Found")
 STOPPED = threading.Event()
 """Set for a moment after Ctrl-C: what a program calls back should give up."""
 _LOCK = threading.Lock()
@@ -21,6 +23,17 @@ def give_up_if_stopped() -> None:
     """Raise a KeyboardInterrupt where Ctrl-C has ended what waits for this; work in pieces asks between them."""
     if STOPPED.is_set():
         raise KeyboardInterrupt
+
+
+def finished(call: Callable[[], _Found]) -> _Found:
+    """Return what a call returns, also where Ctrl-C comes while it works: it begins once more.
+
+    It is for the last seconds of a long measurement, which would else be lost with all before.
+    """
+    try:
+        return call()
+    except KeyboardInterrupt:
+        return call()
 
 
 @contextlib.contextmanager

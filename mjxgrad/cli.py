@@ -8,11 +8,13 @@ import os
 import signal
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from mjxgrad._text import write
+from mjxgrad._warnings import finished
 
 try:
     import cyclopts
@@ -54,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
-    status = 2
+    status, warnings.formatwarning = 2, lambda message, *_, **__: f"{message}\n"  # without a line of the library's code
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
         if interruptions:  # the library has returned what was measured
@@ -114,9 +116,9 @@ def check(
     log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
-    print(verdict, flush=True)
+    print(finished(verdict.summary), flush=True)
     if html is not None:
-        write(html, verdict.as_html())
+        finished(lambda: write(html, verdict.as_html()))
         log(f"wrote {html}")
     return 1 if verdict.faults else 0
 
@@ -160,8 +162,8 @@ def sweep(
     given |= {"noise": noise, "num_samples": samples, "num_reference": 16 * samples, "seed": seed, "log": log}
     given |= {"start": start, "horizon": horizon, "contact": mg.stepping.own_motion(gradient), "engine": engine}
     found = mg.sweep(_existing(scene), cost, **given)
-    print(found, flush=True)
-    write(html, found.as_html())
+    print(finished(lambda: str(found)), flush=True)
+    finished(lambda: write(html, found.as_html()))
     log(f"wrote {html}")
 
 
@@ -188,8 +190,8 @@ def identify(
         recordings: CSV or NPZ files, before the options.
         parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
-            (actuators), delay, and fields of the model: jnt_stiffness:knee, body_pos[2]:shin. kind:one,other is one value
-            for both.
+            (actuators; kp and kv of a position servo, kv of a velocity servo), delay, and fields of the model:
+            jnt_stiffness:knee, body_pos[2]:shin. kind:one,other is one value for both.
         noise: name=standard deviation, of every measured column, or of qpos, qvel and sensors as a whole. Then the answer says
             whether more than noise is left; by default each signal is weighed by how much it varies.
         held_out: share for validation only: every n-th recording, or the end of a single one.
@@ -203,7 +205,12 @@ def identify(
     files, page = (importlib.import_module(f"mjxgrad.identification.{name}") for name in ("files", "page"))
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
-    loaded = mg.load_scene(_existing(scene), keep_everything=True)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        loaded = mg.load_scene(_existing(scene), keep_everything=True)
+    for one in told:
+        if "MJX" not in str(one.message):  # C MuJoCo steps it here
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     wanted = {text.partition("=")[0]: files.parameter(loaded, text) for text in parameter}
     if len(wanted) < len(parameter):
         raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
@@ -220,8 +227,8 @@ def identify(
             log(left_out[-1].strip())  # a slip is seen before the search
         motions.append(dataclasses.replace(one, start=mg.initial_state(loaded)) if start == "exact" else one)
     fitted, judged = files.hold_out(motions, held_out)
-    several = "s" * (len(fitted) > 1)
-    log(f"{len(wanted)} parameters, {len(fitted)} motion{several} to fit, {len(judged)} held out")
+    several = lambda many, word: f"{len(many)} {word}{'s' * (len(many) != 1)}"  # noqa: E731
+    log(f"{several(wanted, 'parameter')}, {several(fitted, 'motion')} to fit, {len(judged)} held out")
     given = {"delay": "delay" if "delay" in wanted else None, "free_start": True if start == "free" else None}
     log(mg.identification.outlook(loaded, wanted, fitted, **given).summary())
 
@@ -231,11 +238,11 @@ def identify(
 
     result = mg.identify(loaded, wanted, fitted, held_out=judged, max_steps=max_steps, log=say, **given)
     output.mkdir(parents=True, exist_ok=True)
-    result.save(output / "params_x_hat.yaml")
-    files.write_xml(loaded, result.scene, scene, output / "identified.xml")
-    print("\n".join([result.headline, "", result.summary(), *left_out]), flush=True)
+    finished(lambda: result.save(output / "params_x_hat.yaml"))
+    finished(lambda: files.write_xml(loaded, result.scene, scene, output / "identified.xml"))
+    print(finished(lambda: "\n".join([result.headline, "", result.summary(), *left_out])), flush=True)
     log(f"wrote {output}/params_x_hat.yaml, identified.xml")
-    text = page.identified_page(Path(scene).name, loaded, result, fitted, judged)
+    text = finished(lambda: page.identified_page(Path(scene).name, loaded, result, fitted, judged))
     write(output / "report.html", text)
     log(f"wrote {output}/report.html")
     return 0 if result.is_sound else 1

@@ -188,10 +188,13 @@ def check(
     is_any_sound = (motions.bad_steps < 0).any()
     if cost is not None and is_any_sound:
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
-    measured, prices = None, {}
+    # Prices come first: after Ctrl-C there is nothing left to measure.
+    measured, asked = None, time.perf_counter()
+    prices = seconds_of(scene) if scene.model.nu and is_any_sound else {}
     if derivatives and is_any_sound:
         say("measuring derivatives by C MuJoCo")
-        mover = Mover(scene, _BATCH, outcomes, max(begun + budget, started + budget / 2))
+        end = max(begun + budget, started + budget / 2) + time.perf_counter() - asked
+        mover = Mover(scene, _BATCH, outcomes, end)
         settings = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
         with contextlib.suppress(TimeoutError, KeyboardInterrupt):
             measured = measure(scene, motions, mover, rng, **settings)
@@ -204,9 +207,6 @@ def check(
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
-    if scene.model.nu and is_any_sound:
-        with contextlib.suppress(KeyboardInterrupt):
-            prices = seconds_of(scene)
     price = prices["slope"] / prices["discrete"] if prices else math.inf
     advice = findings.recommend(motions, stability, measured, slots, price)
     told = slopes(measured.lines) if measured else ()

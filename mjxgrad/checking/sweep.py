@@ -205,7 +205,8 @@ class Sweep(Paged):
             if f"{name}_bias" in table:
                 bias, half = table[f"{name}_bias"][:, 0], table[f"{name}_bias_high"] - table[f"{name}_bias_low"]
                 square = np.maximum(bias**2 - (half[:, 0] / 4) ** 2, 0) + table[f"{name}_variance"][:, 0] / BATCH
-                found[name] = np.sqrt(square) / np.abs(table["truth"][:, 0])
+                with np.errstate(divide="ignore", invalid="ignore"):  # no gradient at all
+                    found[name] = np.sqrt(square) / np.abs(table["truth"][:, 0])
         return found
 
     def best(self) -> list[str]:
@@ -265,7 +266,7 @@ class Sweep(Paged):
         details = Block(folded="Bias and variance in numbers", code=self.result.summary(self.labels))
         blocks = [table, Block(drawings=parts, caption=told), Block(text=self.question), details]
         answer, _, more = self.headline.partition(". ")
-        return page(f"{answer}.", f"mjxgrad sweep {self.name}", [Block(text=more), *blocks])
+        return page(f"{answer.rstrip('.')}.", f"mjxgrad sweep {self.name}", [Block(text=more), *blocks])
 
 
 @in_double
@@ -301,7 +302,8 @@ def sweep(
             `mg.Slope()`.
 
     Raises:
-        ValueError: if there is no such file, function, body or key frame, or a number is out of range.
+        ValueError: if there is no such file, function, body or key frame, a number is out of range, or nothing that the controls
+            move reaches the cost.
     """
     given = np.atleast_1d(np.asarray(real("stiffness", stiffness), float))
     if not ((given > 0) & (given < np.inf)).all():
@@ -321,6 +323,12 @@ def sweep(
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
+    if task.num_controls and isinstance(task.contact, Slope | Discrete):
+        few = knob.truth(Softness(stiffness=jnp.asarray(knob.own or swept[0])), jax.random.key(seed), _PAIRS)
+        if np.abs(few).max() <= _UNFELT * abs(at_rest):
+            wanted = "start nearer, at another key frame, or look further ahead, over a longer horizon"
+            stays = f"stays {at_rest:.3g} in {_PAIRS} motions under the noise"
+            raise ValueError(f"cost must feel the controls, but {stays}: {wanted}")
     given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
     given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
     say, began, last = log or (lambda _: None), [], [0]

@@ -31,6 +31,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, PyTree, Shaped
 from mjxgrad._arrays import function, one_key, whole
 from mjxgrad._programs import compile_once
 from mjxgrad._text import Printed, aligned, format_number
+from mjxgrad._warnings import finished
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
@@ -392,34 +393,40 @@ def bias_variance(
             pool.shutdown(wait=False, cancel_futures=True)
     if not done[0]:
         raise KeyboardInterrupt
-    rows = []
-    for pieces in filter(None, done):
-        empty = [jax.tree.map(jnp.zeros_like, pieces[0][0])] * (len(units) - len(pieces))
-        samples = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *(one for one, *_ in pieces), *empty)
-        measured, terms = summarise(samples)
-        measured["landscape"] = None
-        if line is not None:
-            measured |= pieces[0][1]
-        else:
-            values, errors = (jnp.stack([jnp.asarray(one[1][k]) for one in pieces]) for k in (0, 1))
-            measured["reference"] = values.mean(axis=0)
-            measured["reference_error"] = jnp.sqrt((errors**2).sum(axis=0)) / len(pieces)
-        ends = {k: [bootstrap_variance_interval(x, confidence) for x in np.asarray(one)] for k, one in terms.items()}
-        rows.append((measured, ends))
-    # The first of each kind also begins with memory.
-    spent = [one[2] for pieces in done for one in (pieces[1:] or pieces)]
-    stacked = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
-    found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
-    return BiasVariance(
-        **found,
-        softness=stacked,
-        params=params,
-        variance_intervals={k: np.moveaxis(np.array([ends[k] for _, ends in rows]), -1, 0) for k in rows[0][1]},
-        warnings=told[: len(rows)],
-        confidence=confidence,
-        share=sum(map(len, done)) / len(jobs),
-        seconds=float(np.median(spent)) / units[0].size / len(params) / num_workers,
-    )
+
+    def summed() -> BiasVariance:
+        rows = []
+        for pieces in filter(None, done):
+            empty = [jax.tree.map(jnp.zeros_like, pieces[0][0])] * (len(units) - len(pieces))
+            samples = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *(one for one, *_ in pieces), *empty)
+            measured, terms = summarise(samples)
+            measured["landscape"] = None
+            if line is not None:
+                measured |= pieces[0][1]
+            else:
+                values, errors = (jnp.stack([jnp.asarray(one[1][k]) for one in pieces]) for k in (0, 1))
+                measured["reference"] = values.mean(axis=0)
+                measured["reference_error"] = jnp.sqrt((errors**2).sum(axis=0)) / len(pieces)
+            ends = {
+                k: [bootstrap_variance_interval(x, confidence) for x in np.asarray(one)] for k, one in terms.items()
+            }
+            rows.append((measured, ends))
+        # The first of each kind also begins with memory.
+        spent = [one[2] for pieces in done for one in (pieces[1:] or pieces)]
+        swept = jax.tree.map(lambda leaf: leaf[: len(rows)], stacked)
+        found = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[row[0] for row in rows])
+        return BiasVariance(
+            **found,
+            softness=swept,
+            params=params,
+            variance_intervals={k: np.moveaxis(np.array([ends[k] for _, ends in rows]), -1, 0) for k in rows[0][1]},
+            warnings=told[: len(rows)],
+            confidence=confidence,
+            share=sum(map(len, done)) / len(jobs),
+            seconds=float(np.median(spent)) / units[0].size / len(params) / num_workers,
+        )
+
+    return finished(summed)
 
 
 def _rounds(plan: Plan) -> Int[np.ndarray, "rounds chunks units"]:

@@ -313,7 +313,12 @@ def test_an_interruption_keeps_what_was_measured(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("mjxgrad.checking.measure._Probe.noise", interrupted)
+    own, order = measure, []
+    module = importlib.import_module("mjxgrad.checking.check")
+    monkeypatch.setattr(module, "seconds_of", lambda scene: order.append("prices") or seconds_of(scene))
+    monkeypatch.setattr(module, "measure", lambda *given, **how: order.append("derivatives") or own(*given, **how))
     measured = mg.check(ball(), budget=1000).measured
+    assert order == ["prices", "derivatives"], "or Ctrl-C would wait for prices"
     assert len(measured.lines) == 1
     assert len(measured.left_out) > 3
 

@@ -79,8 +79,8 @@ def test_the_truth_is_the_slope_of_the_smoothed_cost_in_c_mujoco(swept, folder):
     table = swept.result.table()
     for row, stiffness in enumerate(swept.result.knob[1][:2]):
         objective = knob(mg.Softness(stiffness=stiffness))
-        noise = jax.vmap(objective.sample_noise)(keys)
-        ends = [jax.vmap(objective.value, in_axes=(None, 0))(jnp.array([at]), noise) for at in (-width, width)]
+        values = jax.jit(jax.vmap(lambda at, key: objective.value(at, objective.sample_noise(key)), in_axes=(None, 0)))  # noqa: B023
+        ends = [values(jnp.array([at]), keys) for at in (-width, width)]
         slopes = np.asarray(ends[1] - ends[0]) / (2 * width)
         error = np.hypot(slopes.std() / math.sqrt(len(slopes)), (table["truth_high"] - table["truth"])[row, 0] / 2)
         assert abs(slopes.mean() - table["truth"][row, 0]) < 4 * error
@@ -239,6 +239,12 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
     assert " it is 50 % off, first order 200 %, α-order 250 %." in swept.headline
     table |= {name: np.zeros((3, 1)) for name in table if name.endswith("_bias") or name == "truth"}
     assert swept.headline.startswith("Stiffness changes nothing: nothing touches")
+
+
+def test_a_cost_that_feels_nothing_is_refused_before_the_sweep(folder):
+    """A block on a rail has one height; its page would have a zero in every cell, after minutes."""
+    with pytest.raises(ValueError, match="cost must feel the controls, but stays -0 in 256 motions"):
+        mg.sweep(folder / "block.xml", "height:block", horizon=20, engine="mujoco", contact=mg.Discrete())
 
 
 def test_a_sweep_in_single_precision_is_that_in_double(folder):

@@ -1,6 +1,7 @@
 """Bias and variance, measured where both are known."""
 
 import signal
+import sys
 import threading
 import time
 
@@ -206,6 +207,23 @@ def test_an_interruption_leaves_some_rollouts_of_each_softness_and_waits_for_non
     assert (table.first.num_finite == 500).all()
     exact = exact_ramp(lambda point, width: 2 * textbook.ramp_probability(point, width) / width)
     np.testing.assert_array_less(np.abs(table.zeroth.value[..., 0] - exact), 4 * table.zeroth.standard_error[..., 0])
+
+
+def test_an_interruption_at_the_very_end_loses_nothing(monkeypatch):
+    """While intervals are taken, after all rollouts."""
+    own, sent = bootstrap_variance_interval, []
+
+    def interrupted(*given):
+        if not sent:
+            sent.append(True)
+            signal.raise_signal(signal.SIGINT)
+        return own(*given)
+
+    monkeypatch.setattr(sys.modules[bias_variance.__module__], "bootstrap_variance_interval", interrupted)
+    objective = lambda width: parameter_noise(textbook.ramp(width), STDDEV)  # noqa: E731
+    table = bias_variance(objective, POINTS, jax.random.key(0), softness=WIDTHS, num_samples=400)
+    assert sent
+    assert table.share == 1
 
 
 class Hidden(ParameterNoise):
