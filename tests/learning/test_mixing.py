@@ -76,7 +76,7 @@ def test_halves_tell_the_products_of_means_without_their_noise():
         total = sum((half**2).sum() for half in halves)
         return [x * total / 0.05 for x in jax.tree.leaves(found)[:5]]
 
-    found = jax.vmap(draw)(keys)
+    found = jax.jit(jax.vmap(draw))(keys)
     wanted = jax.tree.leaves(products(first, gradient, 3 / 2, 27 / 2))[:5]
     for values, value in zip(found, wanted, strict=True):
         assert abs(values.mean() - value) < 4 * values.std() / len(keys) ** 0.5

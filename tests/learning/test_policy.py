@@ -1,5 +1,6 @@
 """A policy leaves the library: its file, and the ten lines of NumPy that run it."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +10,15 @@ from mjxgrad.learning import Policy
 from mjxgrad.learning.networks import Network, Normaliser
 
 
-@pytest.fixture
-def policy(key):
+@eqx.filter_jit
+def _made(key):
     seen = 3 * jax.random.normal(key, (50, 6)) + jnp.arange(6.0)
     return Policy(Network.make((6, 32, 16, 3), key), Normaliser.make(6).with_more(seen))
+
+
+@pytest.fixture
+def policy(key):
+    return _made(key)
 
 
 def test_a_policy_that_is_loaded_is_the_saved_one_to_the_bit(policy, tmp_path):

@@ -113,7 +113,7 @@ def test_a_light_body_is_solved_beside_a_heavy_one_that_is_already():
     system = System(Inertia(inertia), force, JoinedRows((DenseRows(entries[:, None]),)), jnp.ones(2, bool), rows)
     start = jnp.array([expected[0], 0.0], jnp.float32)
     tolerance = jnp.asarray(1e-6, jnp.float32)
-    found, _ = newton.minimise(RowLayout(0, 0, 2), 100, system, start, tolerance)
+    found, _ = jax.jit(newton.minimise, static_argnums=(0, 1))(RowLayout(0, 0, 2), 100, system, start, tolerance)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
