@@ -183,7 +183,7 @@ class Worker:
         parts = inverse.step_of(self.layout, self.model.opt.timestep, speeds, own, names)
         for k, (_, one) in enumerate(rows):
             for name, value in parts.items():
-                if name in one.found:
+                if name in one.found and name != _OF_TIME:  # which whole steps have given
                     one.found[name][:] = value[k]
 
     def _begun(self, steps: Steps, i: int, raw: _Found) -> _Row | None:

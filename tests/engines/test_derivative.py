@@ -160,6 +160,19 @@ def test_a_policy_is_differentiated_through_the_loop(pushed):
         np.testing.assert_allclose(derivative(0.5), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("contact", [mg.Discrete(), mg.Slope()])
+def test_the_time_step_has_its_derivative(contact):
+    """A fall of n steps of h is of g h² n (n + 1) / 2."""
+    fall = """<mujoco><worldbody><body><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+    scene = mg.load_scene(fall, engine="mujoco")
+
+    def height(timestep):
+        held = scene.with_model(timestep=timestep)
+        return mg.rollout(held, mg.initial_state(scene), horizon=50, contact=contact).qpos[-1, 0]
+
+    np.testing.assert_allclose(jax.jit(jax.grad(height))(0.002), -9.81 * 0.002 * 50 * 51, rtol=1e-4)
+
+
 def test_a_motion_that_diverges_has_finite_derivatives():
     """It stays at its last good state, and is flagged."""
     scene = mg.load_scene(SCENES["free box, pyramids"])
