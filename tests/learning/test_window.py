@@ -18,6 +18,7 @@ from mjxgrad.learning.networks import Network, Normaliser
 from mjxgrad.learning.window import Gradients, Window, _faded, lambda_returns, returned, run_window, window_gradients
 
 STEPS, STDDEV, DISCOUNT = 3, 0.3, 0.9  # of the windows that are run
+COUNT = 8192  # of which means are taken, each with its opposite noise
 
 
 def window_of(rewards, terminated=(), truncated=()):
@@ -120,31 +121,28 @@ def gradients_at(cartpole, networks):
     return run
 
 
-@pytest.mark.parametrize("trace", [0.6, 1.0])
-def test_the_first_order_gradient_is_the_slope_of_each_step_s_lambda_return(
-    cartpole, networks, gradients_at, key, trace
-):
-    """Later actions follow by the policy; the motion is the same to the bit. At a trace of 1 the return is that of the window.
+def test_the_first_order_gradient_is_the_slope_of_each_step_s_lambda_return(cartpole, networks, gradients_at, key):
+    """Later actions follow by the policy; the motion is that of a trace of 1.
 
     Central differences of 1e-5 are off by their square times a third derivative of some hundred: 1e-8.
     """
     actor, critic, normaliser = networks
-    start = cartpole.reset(key)
+    start, trace = cartpole.reset(key), 0.6
     noise = jnp.array([[0.4], [-1.2], [0.7]])
     states = jax.tree.map(lambda x: x[None], start)
     window, _, found = gradients_at(states, noise[None], trace=trace)
-    assert_array_equal(window.seen, gradients_at(states, noise[None])[0].seen)
     assert_allclose(window.seen[0, 0], jnp.concatenate([start.obs, start.physics.qvel]))
     assert jnp.all(window.next_seen[0, :, 3:] != 0)
 
     @jax.jit
     def targets(added):
         window, _ = run_window(cartpole, start, actor, normaliser, added)
-        return lambda_returns(window, lambda obs: critic(normaliser(obs)), DISCOUNT, trace)
+        return lambda_returns(window, lambda obs: critic(normaliser(obs)), DISCOUNT, trace), window.seen
 
+    assert_allclose(window.seen[0], targets(STDDEV * noise)[1], rtol=1e-12, atol=1e-12)
     for t in range(STEPS):
         change = jnp.zeros_like(noise).at[t].set(1e-5)
-        slope = (targets(STDDEV * noise + change) - targets(STDDEV * noise - change))[t] / 2e-5
+        slope = (targets(STDDEV * noise + change)[0] - targets(STDDEV * noise - change)[0])[t] / 2e-5
         assert_allclose(found.first[0, t, 0], DISCOUNT**t * slope, rtol=1e-6)
 
 
@@ -223,26 +221,32 @@ def test_pulled_back_it_is_the_derivative_by_the_parameters(cartpole, networks, 
     actor, critic, normaliser = networks
     start = cartpole.reset(key)
     noise = jnp.array([[0.4], [-1.2], [0.7]])
-    window, _, found = gradients_at(jax.tree.map(lambda x: x[None], start), noise[None])
+    # As many as where means are compared, all alike, so that it is the same program.
+    states, every = jax.tree.map(lambda x: jnp.broadcast_to(x, (2 * COUNT, *x.shape)), (start, noise))
+    window, _, found = gradients_at(states, every)
 
     def gain(actor):
         ran, _ = run_window(cartpole, start, actor, normaliser, STDDEV * noise)
         return returned(ran, lambda obs: critic(normaliser(obs)), DISCOUNT)
 
     whole = jax.jit(jax.grad(gain))(actor)
-    _, pull_back = jax.vjp(lambda a: jax.vmap(lambda seen: a(normaliser(seen)[:3]))(window.seen[0]), actor)
-    (pulled,) = pull_back(found.first[0])
+
+    @jax.jit
+    def pull_back(actor, seen, cotangent):
+        return jax.vjp(lambda a: jax.vmap(lambda seen: a(normaliser(seen)[:3]))(seen), actor)[1](cotangent)
+
+    (pulled,) = pull_back(actor, window.seen[0], found.first[0])
     jax.tree.map(lambda x, y: assert_allclose(x, y, rtol=1e-9, atol=1e-12), pulled, whole)
 
 
 def test_both_gradients_have_the_same_mean(cartpole, gradients_at, key):
     """Nothing jumps, so both are unbiased for the smoothed return; opposite noise takes out what the values have wrong."""
-    start, count = cartpole.reset(key), 8192
-    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (2 * count, *x.shape)), start)
-    noise = jax.random.normal(jax.random.key(5), (count, STEPS, 1))
+    start = cartpole.reset(key)
+    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (2 * COUNT, *x.shape)), start)
+    noise = jax.random.normal(jax.random.key(5), (COUNT, STEPS, 1))
     _, _, found = gradients_at(states, jnp.concatenate([noise, -noise]))
-    difference = (found.zeroth - found.first)[..., 0].reshape(2, count, STEPS).mean(axis=0)
-    error = difference.std(axis=0) / count**0.5
+    difference = (found.zeroth - found.first)[..., 0].reshape(2, COUNT, STEPS).mean(axis=0)
+    error = difference.std(axis=0) / COUNT**0.5
     assert np.all(np.abs(difference.mean(axis=0)) < 4 * error)
     # A missing discount, a tenth or more from the second step on, is seen.
     assert np.all((error < 0.025 * np.abs(found.first[..., 0].mean(axis=0)))[1:])

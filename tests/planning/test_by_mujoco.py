@@ -43,11 +43,11 @@ def start_of(system):
     """Turned, and in motion."""
     change = np.random.default_rng(3).normal(size=system.num_changes)
     change[2:5] = 0.0  # flat on the floor
-    return system.retract(system.origin, jnp.asarray(0.2 * change, system.origin.dtype))
+    return jax.jit(system.retract)(system.origin, jnp.asarray(0.2 * change, system.origin.dtype))
 
 
 def controller_of(system):
-    goal = system.retract(system.origin, 0.3 * jnp.ones(system.num_changes).at[2:5].set(0.0))
+    goal = jax.jit(system.retract)(system.origin, 0.3 * jnp.ones(system.num_changes).at[2:5].set(0.0))
     return Controller(system, GoalCost(goal, 1.0, 10.0, 0.01), jnp.zeros((HORIZON, 2)), schedule=[1.0, 1.0])
 
 
@@ -102,7 +102,7 @@ def test_a_law_turns_a_free_body_as_single_steps_do(error, system, monkeypatch):
     rng = np.random.default_rng(0)
     start, dtype = start_of(system), system.origin.dtype
     changes, gain = (rng.normal(size=(HORIZON, *sizes, system.num_changes)) for sizes in ((), (2,)))
-    nominal = jax.vmap(system.retract, (None, 0))(start, jnp.asarray(0.1 * changes, dtype).at[0].set(0.0))
+    nominal = jax.jit(jax.vmap(system.retract, (None, 0)))(start, jnp.asarray(0.1 * changes, dtype).at[0].set(0.0))
     controls, change = jnp.asarray(rng.normal(size=(2, HORIZON, 2)), dtype)
     limits = jnp.array([1.5, 1.0], dtype)
     course = Course(jnp.concatenate([nominal, nominal[-1:]]), controls, jnp.zeros((), dtype))
