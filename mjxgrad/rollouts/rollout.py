@@ -169,7 +169,7 @@ def _clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str
         row, column = np.argwhere(beyond)[0].tolist()
         name = model.actuator(column).name or column
         reach = (
-            f"{format_number(numbers[row, column])} in step {row}, and its ctrlrange is {format_range(ends[column])}"
+            f"{format_number(float(numbers[row, column]))} in step {row}, and its ctrlrange is {format_range(ends[column])}"
         )
         yield f"a control of actuator {name} is {reach}: MuJoCo clamps it, and it has no derivative there"
 
