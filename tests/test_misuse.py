@@ -528,7 +528,7 @@ FOUND = {
     "warned(optimise, objective=mg.parameter_noise(lambda x: jnp.nan * x.sum(), 0.1))":
         "no step was taken: costs or derivatives were NaN or infinite",
     "warned(mg.rollout, limited, mg.initial_state(limited), [[0.5], [-3.0]])":
-        "a control of actuator 0 is -3 in step 1, and its ctrlrange is -1–1: MuJoCo clamps it",
+        "a control of actuator 0 is -3 in step 1, and its ctrlrange is -1 to 1: MuJoCo clamps it",
     # What must go on to work: a count of something as the cost, NumPy's integers, keys of the old kind.
     "first(cost=lambda x: 3)": "no error",
     "first(cost=lambda x: jnp.sum(x > 0))": "no error",

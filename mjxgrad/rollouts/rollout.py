@@ -168,9 +168,7 @@ def _clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str
     if beyond.any():
         row, column = np.argwhere(beyond)[0].tolist()
         name = model.actuator(column).name or column
-        reach = (
-            f"{format_number(float(numbers[row, column]))} in step {row}, and its ctrlrange is {format_range(ends[column])}"
-        )
+        reach = f"{format_number(float(numbers[row, column]))} in step {row}, and its ctrlrange is {format_range(ends[column], ' to ')}"
         yield f"a control of actuator {name} is {reach}: MuJoCo clamps it, and it has no derivative there"
 
 
