@@ -168,8 +168,9 @@ def _clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str
     if beyond.any():
         row, column = np.argwhere(beyond)[0].tolist()
         name = model.actuator(column).name or column
-        reach = f"{format_number(float(numbers[row, column]))} in step {row}, and its ctrlrange is {format_range(ends[column], ' to ')}"
-        yield f"a control of actuator {name} is {reach}: MuJoCo clamps it, and it has no derivative there"
+        reach, ends = format_number(float(numbers[row, column])), format_range(ends[column], " to ")
+        told = f"{reach} in step {row}, and its ctrlrange is {ends}"
+        yield f"a control of actuator {name} is {told}: MuJoCo clamps it, and it has no derivative there"
 
 
 def sequence_of(
