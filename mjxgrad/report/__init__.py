@@ -133,7 +133,6 @@ def _prose(text: object) -> str:
     """Escape a sentence, with code between backticks; no line ends within a name or between a number and its unit."""
     from markupsafe import Markup, escape
 
-    whole = escape(_UNIT.sub("\N{NO-BREAK SPACE}", str(text))).replace(
-        "α-order", Markup('<span class="whole">α-order</span>')
-    )
+    safe = Markup(_UNIT.sub("\N{NO-BREAK SPACE}", str(escape(text))))  # escaped first, which leaves links as they are
+    whole = safe.replace("α-order", Markup('<span class="whole">α-order</span>'))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(whole)))

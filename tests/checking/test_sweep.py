@@ -103,7 +103,8 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
 def test_the_page_has_answer_picture_table_and_sentence(swept):
     page = swept.as_html()
     answer = swept.headline.partition(". ")[0]
-    assert f"<h1>{answer}.</h1>" in html.unescape(re.sub("</?span.*?>", "", page))
+    plain = html.unescape(re.sub("</?span.*?>", "", page)).replace("\N{NO-BREAK SPACE}", " ")
+    assert f"<h1>{answer}.</h1>" in plain
     assert page.count("<svg role=") == 2  # bias and variance
     assert html.escape(page) in swept._repr_html_()  # a notebook shows it in a frame
     assert page.index("<h1>") < page.index("2500 (file)") < page.index("<svg")
