@@ -22,6 +22,7 @@ except ImportError:
     print("the command line needs cyclopts, not installed: pip install 'mjxgrad[cli]'", file=sys.stderr)
     sys.exit(2)
 
+_ONE = 0.3  # s within which signals are one: `timeout` sends its own twice
 Switch = Annotated[bool, cyclopts.Parameter(negative="")]
 Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
 
@@ -44,11 +45,13 @@ def main(arguments: list[str] | None = None) -> int:
     The exit status is 0, 1 for faults that `check` found or values that `identify` did not, 2 for a refusal, 130 for an
     interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
-    interruptions: list[int] = []
+    interruptions: list[float] = []
 
-    def interrupt(number: int, _: Any) -> None:
-        is_first = not interruptions
-        interruptions.append(number)
+    def interrupt(*_: Any) -> None:
+        is_first, now = not interruptions, time.monotonic()
+        if not is_first and now - interruptions[0] < _ONE:
+            return
+        interruptions.append(now)
         os.write(2, b"interrupted: writing what there is; once more ends at once\n" if is_first else b"interrupted\n")
         if not is_first:
             os._exit(130)

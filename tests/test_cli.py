@@ -1,5 +1,6 @@
 """The command line: what it prints where, its exit codes, and what it writes."""
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -151,6 +152,20 @@ def test_an_interrupted_command_prints_and_writes_what_it_has_measured(
     assert Path("identified/report.html").exists() == (arguments[0] == "identify")
 
 
+def test_a_signal_that_is_sent_twice_at_once_is_one(scene, capsys, monkeypatch, signals):
+    """`timeout` tells a process and then its group."""
+
+    def check(*_, **__):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        raise ValueError("what was measured")
+
+    monkeypatch.setattr(mg, "check", check)
+    assert cli.main(["check", scene]) == 2
+    assert capsys.readouterr().err.endswith("what was measured\n")
+
+
 @pytest.mark.parametrize("signals_sent", [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
 def test_a_signal_within_a_long_computation_ends_the_process_within_a_second_or_two(tmp_path, signals_sent):
     """A sweep that would take many minutes, at its first progress; the answer so far is printed and the page written."""
@@ -180,7 +195,7 @@ def test_a_signal_within_a_long_computation_ends_the_process_within_a_second_or_
         sent = time.monotonic()
         for number in signals_sent:
             process.send_signal(number)
-            time.sleep(0.05)
+            time.sleep(0.4)
         assert process.wait(20) == 130
         spent, told = time.monotonic() - sent, process.stderr.read()
         assert "Traceback" not in told
