@@ -91,7 +91,7 @@ class Worlds:
                 }
                 found = jax.lax.map(run, {k: x.reshape(num, each, *x.shape[1:]) for k, x in padded.items()})
                 return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
-            data = self._data(mj_model, count)
+            data = _held_apart(self._data(mj_model, count), given["time"][0])
 
             def one(given: Values) -> Values:
                 numbers = {k.removeprefix(NUMBER): x for k, x in given.items() if k.startswith(NUMBER)}
@@ -259,6 +259,16 @@ class Worlds:
 def worlds_of(mj_model: mujoco.MjModel, room: int | None) -> Worlds:
     """Return the worlds of a C model, with room for so many contacts each."""
     return Worlds(mj_model, room)
+
+
+def _held_apart(data: mjx.Data, time: Float[Array, ""]) -> mjx.Data:
+    """Return the same data, of which XLA does not know that arrays of zeros are equal.
+
+    Warp writes into what it is given, and equal constants would be one buffer.
+    """
+    nothing = (time < -jnp.finfo(time.dtype).max).astype(jnp.int32)
+    leaves, form = jax.tree.flatten(data)
+    return jax.tree.unflatten(form, [(x + nothing * i).astype(x.dtype) for i, x in enumerate(leaves, start=1)])
 
 
 def _put(mj_model: mujoco.MjModel) -> mjx.Model:
