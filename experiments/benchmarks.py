@@ -311,7 +311,9 @@ def costs(*, batch: int = 256, repeats: int = 7, only: str = "") -> None:
 
 def engines(
     *,
-    scene: Annotated[tuple[SceneName, ...], _Many] = ("hopper", "quadruped", "humanoid"),
+    scene: Annotated[tuple[str, ...], _Many] = ("hopper", "quadruped", "humanoid"),
+    engine: Annotated[tuple[mg.stepping.EngineName, ...], _Many] = ("mujoco", "mjx"),
+    gradient: mg.stepping.Gradient = "slope",
     batch: Annotated[tuple[int, ...], _Many] = (1, 16, 256),
     steps: int = 50,
     repeats: int = 3,
@@ -319,16 +321,19 @@ def engines(
     """Measure a gradient by the start's velocities and all controls, of each engine and of what people write by hand.
 
     Args:
-        scene: the scenes.
+        scene: the scenes, by name, or paths of files of your own.
+        engine: the engines.
+        gradient: the derivative.
         batch: states that are stepped together.
         steps: steps of a rollout.
         repeats: runs after the first one.
     """
     mg.keep_compiled()
-    announce(f"{steps} steps, float32")
+    announce(f"{steps} steps, float32, {gradient} gradient")
     for name in scene:
-        model = mujoco.MjModel.from_xml_path(str(_SCENES[name]))
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # MuJoCo's own differences refuse RK4
+        model = mujoco.MjModel.from_xml_path(str(_SCENES.get(name, name)))
+        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER  # MuJoCo's own differences refuse it
         loaded = mg.load_scene(model)
         for size in batch:
             random = np.random.default_rng(0)
@@ -336,14 +341,15 @@ def engines(
             controls = jnp.asarray(0.1 * random.normal(size=(size, steps, loaded.model.nu)), speeds.dtype)
 
             def cost(
-                speeds: jax.Array, controls: jax.Array, engine: mg.stepping.EngineName, scene: mg.Scene = loaded
+                speeds: jax.Array, controls: jax.Array, by: mg.stepping.EngineName, scene: mg.Scene = loaded
             ) -> jax.Array:
-                by = scene.with_engine(engine)
-                return jnp.sum(mg.rollout(by, mg.initial_state(by, qvel=speeds), controls, contact=mg.Slope()).qpos[-1])
+                scene, contact = scene.with_engine(by), mg.stepping.own_motion(gradient)
+                return jnp.sum(
+                    mg.rollout(scene, mg.initial_state(scene, qvel=speeds), controls, contact=contact).qpos[-1]
+                )
 
             programs: dict[str, Callable] = {
-                engine: jax.vmap(jax.grad(functools.partial(cost, engine=engine), argnums=(0, 1)))
-                for engine in ("mujoco", "mjx")
+                by: jax.vmap(jax.grad(functools.partial(cost, by=by), argnums=(0, 1))) for by in engine
             }
             took = _by_hand(loaded.mj_model, np.asarray(speeds, float), np.asarray(controls, float))
             by_hand = Row("mjd_transitionFD in a Python loop", [took], 0.0, float("nan"))

@@ -34,8 +34,8 @@ class Discrete(eqx.Module):
 class Slope(eqx.Module):
     """MuJoCo's own motion, to the bit, with the derivative whose mean is the slope of the outcome.
 
-    It knows that a change moves the times of contact and limit events. Both engines have it by the same rule: `engines.events`
-    and `engines.flight` say which, `stepping.pairs` has it for MJX.
+    It knows that a change moves the times of contact and limit events. All engines have it by the same rule: `engines.events`
+    and `engines.flight` say which, `stepping.pairs` has it for MJX and MuJoCo Warp.
     """
 
     gradient: ClassVar[Gradient] = "slope"
