@@ -57,8 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
             os._exit(130)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, interrupt)
-    signal.signal(signal.SIGTERM, interrupt)
+    former = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     status, warnings.formatwarning = 2, lambda message, *_, **__: f"{message}\n"  # without a line of the library's code
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
@@ -79,6 +78,9 @@ def main(arguments: list[str] | None = None) -> int:
     # The library refuses by these errors, in a sentence; any other error is a bug.
     except (CommandError, ValueError, OSError, FloatingPointError, ImportError, MemoryError, RuntimeError) as error:
         _say(str(error) or type(error).__name__)
+    finally:  # for programs that call a command
+        for number, handler in former.items():
+            signal.signal(number, handler or signal.SIG_DFL)
     return status
 
 
