@@ -104,12 +104,11 @@ class Controller(Printed):
         self._blank = problem.begin(self.system.origin, controls)
         of = lambda numbers: dataclasses.replace(problem, cost=eqx.combine(numbers, rest))  # noqa: E731
         num = len(controls)
-        # Linear models take longest, and half of them at a time: a decision may end between the halves.
-        self._iteration = [(PARTS[0], begin) for begin in sorted({0, num // 2})] + [(part, 0) for part in PARTS[1:]]
+        # Linear models take longest. With a deadline half of them at a time: a decision may end between the halves.
+        count = num if self.deadline is None else num - num // 2
+        self._iteration = [(PARTS[0], begin) for begin in sorted({0, num - count})] + [(part, 0) for part in PARTS[1:]]
         parts = (
-            lambda numbers, search, factor, _, begin, *__: of(numbers).linearised(
-                search, factor, begin, num - num // 2
-            ),
+            lambda numbers, search, factor, _, begin, *__: of(numbers).linearised(search, factor, begin, count),
             lambda numbers, search, *_: of(numbers).solved(search),
             lambda numbers, search, _, following, __, *given: of(numbers).chosen(search, following, *given)[0],
         )
