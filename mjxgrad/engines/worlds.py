@@ -72,7 +72,7 @@ class Worlds:
             return mjx.make_data(mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
 
     def _of_many(
-        self, mj_model: mujoco.MjModel, function: Callable[[mjx.Data, Values], Values]
+        self, mj_model: mujoco.MjModel, function: Callable[[mjx.Data, dict[str, Any]], Values]
     ) -> Callable[[Values], Values]:
         """Return a function of many worlds, which are the leading axis of all."""
 
@@ -111,7 +111,7 @@ class Worlds:
 
         return run
 
-    def _after(self, data: mjx.Data, numbers: Values) -> Values:
+    def _after(self, data: mjx.Data, numbers: dict[str, Any]) -> Values:
         after = mjx.step(self._model.tree_replace(numbers) if numbers else self._model, data)
         found = {k: getattr(after, k) for k in (*MOTION, "time", "qacc_warmstart", "sensordata")}
         return found | {"overflow": after._impl.overflow.reshape(())}
@@ -124,7 +124,7 @@ class Worlds:
     def _levers(self) -> Float[np.ndarray, "nbody nv"]:
         return events.levers_of(self.mj_model)
 
-    def _surfaces(self, data: mjx.Data, numbers: Values) -> Values:
+    def _surfaces(self, data: mjx.Data, numbers: dict[str, Any]) -> Values:
         """Return the nearest contacts and limits of a world."""
         model = self.mj_model
         # As `events.Surfaces` does: margins are larger by what a state travels in half a step, at most.
@@ -271,7 +271,7 @@ def _held_apart(data: mjx.Data, time: Float[Array, ""]) -> mjx.Data:
     return jax.tree.unflatten(form, [(x + nothing * i).astype(x.dtype) for i, x in enumerate(leaves, start=1)])
 
 
-def _put(mj_model: mujoco.MjModel) -> mjx.Model:
+def _put(mj_model: mujoco.MjModel) -> Any:
     """Return Warp's model; it says nothing of what it lacks room for, which the step counts."""
     warp = sys.modules.get("warp")
     if warp:

@@ -56,6 +56,11 @@ class Motions:
     def _written(self, scene: Scene, vector: Array) -> Scene:
         return write_all(scene, self.parameters, self.coordinates.unravel(vector))
 
+    @property
+    def compiles(self) -> bool:
+        """Whether another number of steps is another program."""
+        return self._engine.compiles
+
     def residuals(
         self,
         windows: Windows,

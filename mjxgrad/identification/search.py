@@ -41,7 +41,9 @@ _TRIALS = (12, 40)  # steps tried at an early horizon and at the last
 _NUM_AWAY, _AWAY, _RUGGED = 12, 2.0, 0.2  # motions and their standard errors away; share of changes that is not linear
 _EXACT = 1e-6  # of the first residuals: nothing is left
 _LEFT = 0.3  # of the first residuals, above which better values are sought where the noise is not known
-_SCATTERED, _BEST = 256, 3  # motions between the bounds, and those from which descents begin anew
+_SCATTERED, _BEST = 512, 3  # motions between the bounds, and those from which descents begin anew
+_ROUNDS = 32  # horizons over which they are chosen; with 16 one of five recordings of a turning box is lost
+_KEPT, _BESIDE = 8, 0.5  # of how many one is kept; how far beside these others are tried, in their spreads
 _SPREAD = 0.05  # of a coordinate, by which the first motions of an ensemble differ at least
 _DESCENT, _ENSEMBLES = 24, 7  # derivatives of whole motions, and ensembles, that a search takes, about
 _CORE = 0.3  # of the noise or of the first residuals, beyond which a residual of these counts by its logarithm
@@ -420,17 +422,28 @@ class _Search:
         return after > _LEFT * self.first
 
     def _scattered(self, noise: float | None) -> Iterator[Point]:
-        """Yield the points between the bounds whose motions fit best, most of their course."""
-        problem, rng = self.problem, np.random.default_rng(1)
-        low, high = problem.motions.coordinates.box()
+        """Yield the points whose motions fit best, most of their course, of many between the bounds and beside the best."""
+        # What fits a first part is where to look for what fits more of it: chaos hides the rest at first.
+        problem, rng, motions = self.problem, np.random.default_rng(1), self.problem.motions
+        low, high = motions.coordinates.box()
         low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
         values = rng.uniform(low, high, (_SCATTERED, problem.count))
         starts = np.zeros((_SCATTERED, *problem.sizes.shape)) + self.end.point.starts
-        found = problem.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], problem.num_steps)
-        losses = np.log1p((found / (_CORE * (noise or self.first))) ** 2).sum(axis=(1, 2))
-        for i in np.argsort(np.where(np.isfinite(losses), losses, np.inf))[:_BEST]:
-            if np.isfinite(losses[i]):
-                yield Point(values[i], starts[i])
+        shares = _HORIZONS if motions.compiles else np.geomspace(_HORIZONS[0], 1.0, _ROUNDS)
+        horizons = sorted({max(round(share * problem.num_steps), 1) for share in shares})
+        for i, steps in enumerate(horizons, start=1):
+            found = problem.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], steps)
+            losses = np.log1p((found / (_CORE * (noise or self.first))) ** 2).sum(axis=(1, 2))
+            order = np.argsort(np.where(np.isfinite(losses), losses, np.inf))
+            best = values[order[: _SCATTERED // _KEPT]]
+            if i == len(horizons):
+                for one in order[:_BEST]:
+                    if np.isfinite(losses[one]):
+                        yield Point(values[one], starts[one])
+                return
+            beside = best[rng.integers(len(best), size=_SCATTERED - len(best))]
+            beside = beside + _BESIDE * best.std(axis=0) * rng.normal(size=beside.shape)
+            values = np.concatenate([best, np.clip(beside, low, high)])
 
     def _average(self, noise: float) -> Stopped:
         """Fit the mean of many motions, from the best end, and keep it unless that explains nothing more."""
