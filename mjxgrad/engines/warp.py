@@ -119,6 +119,10 @@ class _Program(pairs.Program):
     def near_after(self, given: tuple, ends: World) -> pairs.Gaps | None:
         return self.rows(given)
 
+    def gap_rates(self, given: tuple, tangents: tuple, moving: Any) -> Array:
+        told = "MuJoCo Warp's slope has no derivative by places of mocap bodies"
+        raise NotImplementedError(f"{told}: take mg.Discrete(), or scene.with_engine('mujoco')")
+
 
 def _world(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> World:
     found = {name: getattr(scene.data, name) for name in INPUTS} | inputs

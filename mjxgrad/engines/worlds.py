@@ -183,11 +183,8 @@ class Worlds:
         if not names:
             return found, zeros
         parts = [self._to_tangent(given[k], changes[k]) if k == "qpos" else changes[k].reshape(-1) for k in names]
-        moved = jnp.matmul(
-            self.derivative(given | {"qacc_warmstart": found["qacc_warmstart"]}, names),
-            jnp.concatenate(parts),
-            precision="highest",
-        )
+        solved = given | {"qacc_warmstart": found["qacc_warmstart"]}  # from there the solver takes an iteration or two
+        moved = jnp.matmul(self.derivative(solved, names), jnp.concatenate(parts), precision="highest")
         sizes = [self.mj_model.nv, self.mj_model.nv, self.mj_model.na]
         qpos, qvel, act, sensed = jnp.split(moved, np.cumsum(sizes))
         return found, zeros | {
@@ -196,7 +193,6 @@ class Worlds:
 
     def derivative(self, given: Values, names: tuple[str, ...]) -> Float[Array, "outputs columns"]:
         """Return the derivative of the next state, in tangent space, and of readings by what is given, by central differences."""
-        # From the solution of the step itself the solver takes one or two iterations.
         dtype, points, widths = given["qpos"].dtype, [], []
         given = {k: jax.lax.stop_gradient(x).astype(jnp.float32) for k, x in given.items()}  # so that widths are Warp's
         for name in names:

@@ -161,6 +161,12 @@ class Program:
             return self.rows(given)
         return gaps_of(self.all_of(given)[0], put(ends, taken(given[1])))
 
+    def gap_rates(self, given: _Given, tangents: _Given, moving: Any) -> Float[Array, " all"]:
+        """Return how gaps change with what moves surfaces beside the motion: sizes, places, ranges."""
+        own, kept = eqx.partition(given, moving)
+        gaps = lambda own: self.rows(eqx.combine(own, kept)).gaps  # noqa: E731
+        return jax.jvp(gaps, (own,), (eqx.filter(tangents, moving),))[1]
+
 
 def _put_in(given: _Given, motion: Motion) -> _Given:
     return given[0], put(given[1], motion)
@@ -236,9 +242,7 @@ class _Step:
             feels = events.rows @ change[: self.nv] + events.ahead @ change[self.nv : 2 * self.nv]
             moving = others[0], others[1].replace(**dict.fromkeys(_FORCES, False))
             if any(jax.tree.leaves(moving)):
-                own, kept = eqx.partition(self.given, moving)
-                gaps = lambda own: program.rows(eqx.combine(own, kept)).gaps  # noqa: E731
-                gap_rates = jax.jvp(gaps, (own,), (eqx.filter(tangents, moving),))[1]
+                gap_rates = program.gap_rates(self.given, tangents, moving)
                 feels = feels + events.weights @ gap_rates[events.chosen]
             change = change.at[: self.nv].add(-events.moves @ feels)
             heard = jnp.where(plan.goes_on, heard, 0.0) + plan.places @ feels

@@ -138,3 +138,15 @@ def test_what_warp_lacks_is_said():
     scene = mg.load_scene(CART, engine="warp")
     with pytest.raises(ValueError, match=r"was loaded for MuJoCo Warp: leave out engine='warp'"):
         mg.rollout(scene, mg.initial_state(scene), np.zeros((2, 1)), contact=mg.Onset())
+    bat = """<mujoco><worldbody><body mocap="true"><geom type="plane" size="1 1 .1"/></body><body pos="0 0 .1"><joint type="slide"
+        axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>"""
+    scene = mg.load_scene(bat, engine="warp")
+
+    def end(height):
+        places = {"mocap_pos": jnp.zeros((2, 1, 3)).at[:, :, 2].set(height)}
+        return mg.rollout(scene, mg.initial_state(scene), np.zeros((2, 0)), inputs=places, contact=mg.Slope()).qpos[
+            -1, 0
+        ]
+
+    with pytest.raises(NotImplementedError, match="slope has no derivative by places of mocap bodies: take"):
+        jax.jit(jax.grad(end)).lower(0.0)
