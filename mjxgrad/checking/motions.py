@@ -188,7 +188,8 @@ def seconds_of(scene: Scene) -> dict[str, float]:
     for kind in ("motion", *KINDS):
         take(kind, 2)  # begins with threads and memory
         spent = []
-        while len(spent) < 2 or (sum(spent) < _SOON and len(spent) < 4):  # other programs take the processor for a while
+        # Other programs take the processor for a while.
+        while len(spent) < 2 or (sum(spent) < _SOON and len(spent) < 4):
             began = time.perf_counter()
             take(kind, _TIMED)
             spent.append(time.perf_counter() - began)

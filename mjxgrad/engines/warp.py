@@ -14,11 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from mjxgrad._mjx import mjx
+from mjxgrad.engines.bridge import NUMBER, Values
 from mjxgrad.engines.engine import Inputs, Motion, Observe, Rows
 from mjxgrad.engines.mjx import MJX, Moving, Scan, roll_out
 from mjxgrad.engines.mujoco import observed
 from mjxgrad.engines.state import State, Trajectory, state_of
-from mjxgrad.engines.worlds import GIVEN, INPUTS, NUMBER, Values, Worlds, worlds_of
+from mjxgrad.engines.worlds import GIVEN, INPUTS, Worlds, worlds_of
 from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Contact, Discrete, Slope, pairs
@@ -132,7 +133,11 @@ def _world(scene: Scene, state: State, ctrl: Array, inputs: Inputs) -> World:
 
 
 def _values(scene: Scene, world: World) -> Values:
-    numbers = {NUMBER + name: jnp.asarray(value) for name, value in changed_numbers(scene).items()}
+    changed, worlds = changed_numbers(scene), _worlds(scene)
+    if lost := [name for name in scene.more if not worlds.has(name)]:
+        told = f"MuJoCo Warp has no {', '.join(lost)} of its own to change"
+        raise NotImplementedError(f"{told}: take scene.with_engine('mujoco')")
+    numbers = {NUMBER + name: jnp.asarray(value) for name, value in changed.items()}
     return {name: getattr(world, name) for name in GIVEN} | numbers
 
 

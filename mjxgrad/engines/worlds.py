@@ -2,8 +2,6 @@
 
 import copy
 import functools
-import logging
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -16,17 +14,15 @@ from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from mjxgrad._mjx import mjx
-from mjxgrad.batched.device import own_device
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.engines import events
-from mjxgrad.scene import SceneError
+from mjxgrad.engines.bridge import NUMBER, Program, Room, Values
 from mjxgrad.stepping import pairs, slope
 
 _POSITION, _OTHER = 3e-5, 1e-3  # widths of differences (m or rad; m/s, rad/s or the unit of an input)
 _CLEAR = 0.8  # of the way to a surface, which differences of positions may go
 _LEAST = 2e-6  # of their widths; rounding is 3 % of such a difference
-_AT_ONCE = 2**32  # bytes of the worlds that are stepped in one call
+_AT_ONCE = 2**32  # bytes of Warp's data for the worlds of one call
 _ROOM = 48  # contacts of a world, unless `max_contacts` says
 _TILE = 64  # Warp reads rows in blocks of so many, beyond the end if they do not fit
 _NEAREST = 24  # contacts and limits of a world that its slope looks at
@@ -38,50 +34,37 @@ MOTION = ("qpos", "qvel", "act")
 INPUTS = ("qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat")
 _VARIED = (*MOTION, "ctrl", *INPUTS)  # by which there are derivatives
 GIVEN = (*_VARIED, "qacc_warmstart", "time")
-NUMBER = "model."
-"""What the names of the model's numbers begin with that are not those of its file."""
-Values = dict[str, Array]
+_FOUND = (*MOTION, "time", "qacc_warmstart", "sensordata")
 
 
 class Worlds:
     """Steps of many worlds of one C model, and their differences."""
 
     def __init__(self, mj_model: mujoco.MjModel, room: int | None):
-        self.mj_model, self._room = mj_model, room or _ROOM
+        self.mj_model, contacts = mj_model, room or _ROOM
         dims = np.concatenate([mj_model.geom_condim, mj_model.pair_dim, [1]])
-        self._rows = mj_model.nv + 6 * mj_model.neq + mj_model.njnt + 2 * mj_model.ntendon
-        self._rows += self._room * max(1, 2 * (int(dims.max()) - 1))
-        self._rows = -(-self._rows // _TILE) * _TILE
+        rows = mj_model.nv + 6 * mj_model.neq + mj_model.njnt + 2 * mj_model.ntendon
+        rows += contacts * max(1, 2 * (int(dims.max()) - 1))
+        self._room = Room(contacts, -(-rows // _TILE) * _TILE)
         has_limits = mj_model.jnt_limited.any() or mj_model.tendon_limited.any()
         self.has_surfaces = bool(has_limits or mj_model.nflex or mj_model.npair or (mj_model.geom_contype > 0).any())
-        self._far = copy.deepcopy(mj_model)  # whose rows are wanted, in full, and not the solution
-        self._far.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        self._far.opt.iterations = self._far.opt.ls_iterations = 1
-        try:
-            self._model = _put(mj_model)
-            self._size = sum(x.nbytes for x in jax.tree.leaves(self._data(mj_model, 1)) if eqx.is_array(x))
-        except (NotImplementedError, RuntimeError) as error:
-            raise SceneError(f"MuJoCo Warp cannot step it: {error}") from error
-        self._run = self._of_many(mj_model, self._after)
-        self._run_near = self._of_many(self._far, self._surfaces)
+        self._program = Program(mj_model, "step", (*_FOUND, "overflow"), self._room)
+        self._run, self._run_near = self._of_many(self._program), self._of_many(self._surfaces)
         self.step = jax.custom_jvp(self._step)
         self.step.defjvp(self._derived, symbolic_zeros=True)
 
-    def _data(self, mj_model: mujoco.MjModel, count: int) -> mjx.Data:
-        with jax.ensure_compile_time_eval():
-            return mjx.make_data(mj_model, impl="warp", naconmax=count * self._room, njmax=self._rows)
+    def has(self, name: str) -> bool:
+        """Return whether Warp has a number of the model."""
+        return self._program.has(name)
 
-    def _of_many(
-        self, mj_model: mujoco.MjModel, function: Callable[[mjx.Data, dict[str, Any]], Values]
-    ) -> Callable[[Values], Values]:
+    def _of_many(self, function: Callable[[Values], Values]) -> Callable[[Values], Values]:
         """Return a function of many worlds, which are the leading axis of all."""
 
-        # One call of Warp takes all of a batch, as far as memory goes. The function takes data of one world, and
-        # numbers of its model.
+        # One call of Warp takes all of a batch, as far as memory goes.
         @custom_vmap
         def run(given: Values) -> Values:
             count = len(given["qpos"])
-            most = max(1, _AT_ONCE // self._size)
+            most = max(1, _AT_ONCE // self._program.bytes_each)
             if count > most:
                 num = -(-count // most)
                 each = -(-count // num)
@@ -91,15 +74,8 @@ class Worlds:
                 }
                 found = jax.lax.map(run, {k: x.reshape(num, each, *x.shape[1:]) for k, x in padded.items()})
                 return {k: x.reshape(num * each, *x.shape[2:])[:count] for k, x in found.items()}
-            data = _held_apart(self._data(mj_model, count), given["time"][0])
-
-            def one(given: Values) -> Values:
-                numbers = {k.removeprefix(NUMBER): x for k, x in given.items() if k.startswith(NUMBER)}
-                return function(data.replace(**{k: x for k, x in given.items() if k in GIVEN}), numbers)
-
-            found = jax.vmap(one)({k: x.astype(jnp.float32) for k, x in given.items()})
             dtype = given["qpos"].dtype
-            return {k: x.astype(dtype) if eqx.is_inexact_array(x) else x for k, x in found.items()}
+            return {k: x.astype(dtype) if eqx.is_inexact_array(x) else x for k, x in function(given).items()}
 
         @run.def_vmap
         def _(size: int, is_batched: list, given: Values) -> tuple[Values, dict]:
@@ -111,53 +87,63 @@ class Worlds:
 
         return run
 
-    def _after(self, data: mjx.Data, numbers: dict[str, Any]) -> Values:
-        after = mjx.step(self._model.tree_replace(numbers) if numbers else self._model, data)
-        found = {k: getattr(after, k) for k in (*MOTION, "time", "qacc_warmstart", "sensordata")}
-        return found | {"overflow": after._impl.overflow.reshape(())}
-
     @functools.cached_property
-    def _far_model(self) -> mjx.Model:
-        return _put(self._far)
+    def _far(self) -> Program:
+        model = copy.deepcopy(self.mj_model)  # whose rows are wanted, in full, and not the solution
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        model.opt.iterations = model.opt.ls_iterations = 1
+        rows = tuple(f"efc.{name}" for name in ("J", "type", "id", "pos", "margin"))
+        return Program(model, "forward", (*rows, "nefc", "contact.solimp", "qacc_smooth"), self._room)
 
     @functools.cached_property
     def _levers(self) -> Float[np.ndarray, "nbody nv"]:
         return events.levers_of(self.mj_model)
 
-    def _surfaces(self, data: mjx.Data, numbers: dict[str, Any]) -> Values:
-        """Return the nearest contacts and limits of a world."""
-        model = self.mj_model
-        # As `events.Surfaces` does: margins are larger by what a state travels in half a step, at most.
-        least, levers = slope.LEAST_WIDTH * slope.USUAL_WIDTH, self._levers
+    def _surfaces(self, given: Values) -> Values:
+        """Return the nearest contacts and limits of each world."""
+        extra = jax.vmap(self._extra)(given)
+        names = {"geom_margin": "contact", "pair_margin": "contact", "jnt_margin": "limit", "tendon_margin": "limit"}
+        margins = {}
+        for name, kind in names.items():
+            own = given.get(NUMBER + name, jnp.asarray(getattr(self.mj_model, name), jnp.float32))
+            margins[NUMBER + name] = own + extra[kind][:, None] * (0.5 if name == "geom_margin" else 1.0)
+        found = self._far(given | margins)
+        solimp = found.pop("contact.solimp")
+        numbers = {k: x for k, x in given.items() if k.startswith(NUMBER)}
+        return jax.vmap(functools.partial(self._nearest, solimp))(found, extra, numbers)
+
+    def _extra(self, given: Values) -> dict[str, Array]:
+        """Return by how much margins are larger than a world's own: what a state travels in half a step, at most."""
+        # As `events.Surfaces` does.
+        model, levers = self.mj_model, self._levers
+        least = slope.LEAST_WIDTH * slope.USUAL_WIDTH
         stages = 1.5 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
-        travel = stages * numbers.get("opt.timestep", model.opt.timestep) * jnp.abs(data.qvel)
+        travel = stages * given.get(NUMBER + "opt.timestep", model.opt.timestep) * jnp.abs(given["qvel"])
         contact = least + jax.lax.top_k(levers @ travel, 2)[0].sum()
-        limit = least + max(1.0, levers.max(initial=0.0)) * travel.sum()
-        more = {"geom_margin": contact / 2, "pair_margin": contact, "jnt_margin": limit, "tendon_margin": limit}
-        margins = {k: numbers.get(k, jnp.asarray(getattr(model, k))) + x for k, x in more.items()}
-        margins = {k: x.astype(jnp.float32) for k, x in margins.items()}
-        found = mjx.forward(self._far_model.tree_replace(numbers | margins), data)
-        rows, kind, index = found._impl.efc__J[:, : model.nv], found._impl.efc__type, found._impl.efc__id
+        return {"contact": contact, "limit": least + max(1.0, levers.max(initial=0.0)) * travel.sum()}
+
+    def _nearest(self, solimps: Float[Array, "contacts 5"], found: Values, extra: Values, numbers: Values) -> Values:
+        rows, kind, index = found["efc.J"][:, : self.mj_model.nv], found["efc.type"], found["efc.id"]
         is_contact, is_joint = kind >= _CONTACT, kind == _JOINT
         is_first = jnp.concatenate([jnp.ones(1, bool), (index[1:] != index[:-1]) | ~is_contact[:-1]])
         is_one = (is_contact & is_first) | is_joint | (kind == _TENDON)
-        is_one &= jnp.arange(len(kind)) < found._impl.nefc.reshape(())
-        gaps = found._impl.efc__pos - found._impl.efc__margin + jnp.where(is_contact, contact, limit)
+        is_one &= jnp.arange(len(kind)) < found["nefc"]
+        gaps = found["efc.pos"] - found["efc.margin"] + jnp.where(is_contact, extra["contact"], extra["limit"])
         gaps = jnp.where(is_one, gaps, _FAR)
         nearest = jax.lax.top_k(-jnp.abs(gaps), min(_NEAREST, len(gaps)))[1]
         is_contact, is_joint, index = is_contact[nearest], is_joint[nearest], index[nearest]
         # The first two edges of a pyramid, n + μt and n - μt, have the normal as their mean.
         other = nearest + (kind[nearest] == _PYRAMID)
         normals = 0.5 * (rows[nearest] + rows.at[other].get(mode="clip"))
-        solimp = found._impl.contact__solimp.at[index].get(mode="clip")
+        solimp = solimps.at[index].get(mode="clip")
         for name, is_own in (("jnt_solimp", is_joint), ("tendon_solimp_lim", ~is_contact & ~is_joint)):
-            table = numbers.get(name, jnp.asarray(getattr(model, name), jnp.float32))
+            table = numbers.get(NUMBER + name, jnp.asarray(getattr(self.mj_model, name), jnp.float32))
             if len(table):
                 solimp = jnp.where(is_own[:, None], table.at[index].get(mode="clip"), solimp)
         is_one = is_one[nearest]
         return {
             "rows": jnp.where(is_one[:, None], normals, 0.0), "gaps": gaps[nearest], "solimp": solimp,
-            "is_contact": is_contact, "is_blind": jnp.zeros_like(is_contact), "acceleration": found.qacc_smooth,
+            "is_contact": is_contact, "is_blind": jnp.zeros_like(is_contact), "acceleration": found["qacc_smooth"],
         }  # fmt: skip
 
     def near(self, given: Values) -> pairs.Gaps:
@@ -255,30 +241,3 @@ class Worlds:
 def worlds_of(mj_model: mujoco.MjModel, room: int | None) -> Worlds:
     """Return the worlds of a C model, with room for so many contacts each."""
     return Worlds(mj_model, room)
-
-
-def _held_apart(data: mjx.Data, time: Float[Array, ""]) -> mjx.Data:
-    """Return the same data, of which XLA does not know that arrays of zeros are equal.
-
-    Warp writes into what it is given, and equal constants would be one buffer.
-    """
-    nothing = (time < -jnp.finfo(time.dtype).max).astype(jnp.int32)
-    leaves, form = jax.tree.flatten(data)
-    return jax.tree.unflatten(form, [(x + nothing * i).astype(x.dtype) for i, x in enumerate(leaves, start=1)])
-
-
-def _put(mj_model: mujoco.MjModel) -> Any:
-    """Return Warp's model; it says nothing of what it lacks room for, which the step counts."""
-    warp = sys.modules.get("warp")
-    if warp:
-        warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # a library must not print
-    with jax.ensure_compile_time_eval():  # also within a traced function
-        model = mjx.put_model(mj_model, impl="warp", graph_mode=_graph_mode(warp))
-    return model.tree_replace({"opt._impl.warn_overflow": 0})
-
-
-def _graph_mode(warp: Any) -> Any:
-    """Return how Warp's kernels are launched: one by one, or on a GPU as a graph over buffers of its own."""
-    # A graph over JAX's buffers would be captured for every set of addresses, and a scan's inputs lie elsewhere in each step.
-    modes = warp and warp.JaxCallableGraphMode
-    return modes and (modes.NONE if own_device().platform == "cpu" else modes.WARP_STAGED)

@@ -23,7 +23,7 @@ from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import conversions as rules
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
-from mjxgrad.scene.scene import OF_FILES, Scene, SceneError, SceneWarning, check_installed, numbers_of
+from mjxgrad.scene.scene import OF_FILES, Scene, SceneError, SceneWarning, check_engine, numbers_of
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
@@ -74,13 +74,13 @@ def load_scene(
     instance("softness", softness, Softness | None, "mg.Softness, such as mg.Softness(stiffness=1e4)")
     one_of("engine", engine, (*get_args(EngineName), None))
     instance("keep_everything", keep_everything, bool, "True or False")
-    check_installed(engine)
     if max_contacts is not None and whole("max_contacts", max_contacts, None) < 1:
         raise ValueError(f"max_contacts must be at least 1, got {max_contacts}; None has room for all")
     with collected() as told:
         mj_model, name = _compile(source)
     _set_timestep(mj_model, name, timestep)
     _check_model(mj_model, name)
+    check_engine(engine, mj_model)
     mj_model, stepped, conversions, unsupported = _converted(mj_model, name, engine)
     omissions = ()
     if not keep_everything and not unsupported:

@@ -88,12 +88,12 @@ class Scene(eqx.Module):
 
         Raises:
             ValueError: if there is no such engine.
-            SceneError: if MJX cannot step the scene, or NVIDIA Warp is not installed.
+            SceneError: if MJX cannot step the scene, NVIDIA Warp is not installed, or it would lose delays.
         """
         one_of("engine", engine, get_args(EngineName))
         if engine == "mjx" and self.unsupported:
             raise SceneError(self.unsupported)
-        check_installed(engine)
+        check_engine(engine, self.mj_model)
         return dataclasses.replace(self, chosen=engine)
 
     def contact_parameters(self) -> ContactParameters:
@@ -253,10 +253,14 @@ def numbers_of(model: mjx.Model) -> dict[str, Array]:
     return {k: v for k, v in every.items() if isinstance(v, jax.Array) and jnp.issubdtype(v.dtype, jnp.floating)}
 
 
-def check_installed(engine: EngineName | None) -> None:
-    """Refuse MuJoCo Warp where NVIDIA Warp is missing."""
-    if engine == "warp" and importlib.util.find_spec("warp") is None:
+def check_engine(engine: EngineName | None, mj_model: mujoco.MjModel) -> None:
+    """Refuse MuJoCo Warp where NVIDIA Warp is missing, and what a rollout by it does not carry from step to step."""
+    if engine != "warp":
+        return
+    if importlib.util.find_spec("warp") is None:
         raise SceneError("engine='warp' needs NVIDIA Warp: pip install 'mjxgrad[warp]'")
+    if mj_model.nhistory:
+        raise SceneError("engine='warp' carries no delays of actuators or sensors: take engine='mujoco'")
 
 
 def changed_numbers(scene: "Scene") -> dict[str, Array]:

@@ -12,6 +12,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.engines import worlds
+from mjxgrad.scene import SceneError
 from tests.engines.test_derivative import SCENES
 from tests.engines.whole_steps import by_whole_steps
 
@@ -86,11 +87,24 @@ def test_every_motion_of_a_batch_may_have_its_own_numbers():
         other = scene.with_model(body_mass=scene.model.body_mass.at[1].set(mass))
         return mg.rollout(other, mg.initial_state(other), controls, contact=mg.Discrete()).qpos[-1]
 
-    found = jax.vmap(lambda mass: end(scene, mass))(masses)
+    found = jax.vmap(lambda mass: end(scene, mass))(masses)  # its constants follow
     expected = [end(scene.with_engine("mujoco"), mass) for mass in masses]
     np.testing.assert_allclose(found, expected, atol=1e-5)
     with pytest.raises(NotImplementedError, match=r"no derivative by actuator_acc0, .*body_mass.*: take"):
         jax.grad(lambda mass: end(scene, mass)[0])(1.0)
+
+
+def test_numbers_that_warp_keeps_in_another_form_are_c_mujocos():
+    xml = """<mujoco><option timestep=".005" cone="elliptic"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .099">
+        <freejoint/><geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+    scene = mg.load_scene(xml, engine="mujoco")
+    start, other = mg.initial_state(scene, qvel=np.array([1.0, 0.3, 0, 0, 0, 2.0])), scene.with_model(impratio=10.0)
+    found, expected, before = (
+        mg.rollout(one, start, np.zeros((30, 0)), contact=mg.Discrete()).qpos[-1]
+        for one in (other.with_engine("warp"), other, scene)
+    )
+    np.testing.assert_allclose(found, expected, atol=3e-6)
+    assert np.abs(expected - before).max() > 1e-4
 
 
 def test_contacts_without_room_are_counted():
@@ -150,3 +164,6 @@ def test_what_warp_lacks_is_said():
 
     with pytest.raises(NotImplementedError, match="slope has no derivative by places of mocap bodies: take"):
         jax.jit(jax.grad(end)).lower(0.0)
+    slow = CART.replace('gear="5"', 'gear="5" delay="0.05" nsample="8"')
+    with pytest.raises(SceneError, match="carries no delays"):
+        mg.load_scene(slow, engine="warp")
