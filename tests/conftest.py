@@ -3,6 +3,7 @@
 import functools
 import gc
 import os
+import signal
 from pathlib import Path
 
 import jax
@@ -59,6 +60,14 @@ def pytest_runtest_teardown(item, nextitem):
     if MAPS.exists() and len(MAPS.read_bytes().splitlines()) > 30_000:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(autouse=True)
+def hears_interrupts():
+    """A shell's background processes ignore Ctrl-C, and tests would wait there for what it ends."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

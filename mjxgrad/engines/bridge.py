@@ -45,7 +45,7 @@ class Program:
         self._mj_model, self._room, self._warp, self._mjw = mj_model, room, warp, mujoco_warp
         self._function = getattr(mujoco_warp, function)
         self._models: dict[str, Any] = {}
-        self._operations: dict[tuple[str, ...], Callable[[Values], Values]] = {}
+        self._operations: dict[tuple[str, ...], Callable[[Array], Array]] = {}
         with warp.ScopedDevice("cpu"):
             try:
                 data, self._own = self._data(1), self._model()
@@ -88,7 +88,7 @@ class Program:
     def _operation(self, names: tuple[str, ...]) -> Callable[[Array], Array]:
         warp, stores = self._warp, collections.OrderedDict()
         run = lambda given, found: self._run(names, stores, given, found)  # noqa: E731
-        run.__annotations__ = dict.fromkeys(("given", "found"), warp.array(dtype=float, ndim=2))
+        run.__annotations__ = {name: warp.array(dtype=float, ndim=2) for name in ("given", "found")}  # pyright: ignore
         # Warp would capture a graph for each call of a program; one for each number of worlds is enough.
         call = warp.jax_callable(run, graph_mode=warp.JaxCallableGraphMode.NONE)
         width = sum(self._sizes.values())

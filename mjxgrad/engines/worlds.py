@@ -118,7 +118,8 @@ class Worlds:
         model, levers = self.mj_model, self._levers
         least = slope.LEAST_WIDTH * slope.USUAL_WIDTH
         stages = 1.5 if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 else 0.5
-        travel = stages * given.get(NUMBER + "opt.timestep", model.opt.timestep) * jnp.abs(given["qvel"])
+        timestep = given.get(NUMBER + "opt.timestep", jnp.asarray(model.opt.timestep))
+        travel = stages * timestep * jnp.abs(given["qvel"])
         contact = least + jax.lax.top_k(levers @ travel, 2)[0].sum()
         return {"contact": contact, "limit": least + max(1.0, levers.max(initial=0.0)) * travel.sum()}
 

@@ -15,14 +15,6 @@ from mjxgrad.loop import Method, run
 PAUSE = 0.1  # s
 
 
-@pytest.fixture(autouse=True)
-def heard():
-    """A shell's background processes ignore Ctrl-C, and so would these tests there."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 class Slow(Method):
     """A count, each step of which takes a tenth of a second in a thread of C++."""
 
