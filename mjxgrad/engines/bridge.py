@@ -28,7 +28,7 @@ _KEPT_AS: dict[str, tuple[str, Callable[[Array], Array]]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """What a world has room for."""
+    """Room of a world."""
 
     contacts: int
     rows: int
