@@ -145,11 +145,16 @@ def contact_parameters(model: mjx.Model, pairs: Pairs) -> ContactParameters:
 
 def _mixed(model: mjx.Model, pairs: Pairs) -> Iterator[Array]:
     """Yield `solref`, `solimp`, friction and margin of pairs, as MJX's contacts have them."""
-    model = model.replace(geom_solmix=jnp.maximum(model.geom_solmix, mujoco.mjMINVAL))  # no quotient of zeros
+    model = model.replace(
+        geom_solmix=jnp.maximum(model.geom_solmix, mujoco.mjMINVAL),  # no quotient of zeros
+        # MJX makes a group for any two shapes and meshes, of which there are hundreds; parameters do not depend on them.
+        geom_type=np.full_like(model.geom_type, mujoco.mjtGeom.mjGEOM_SPHERE),
+        geom_dataid=np.full_like(model.geom_dataid, -1),
+    )
     groups = contact_groups(model, _NOWHERE) if pairs else {}  # pyright: ignore[reportArgumentType]
     every = itertools.chain.from_iterable(geom_groups(model).values())
-    places = {tuple(map(int, one)): place for place, one in enumerate(every)}
-    index = np.array([places[pair.geom1, pair.geom2, pair.explicit] for pair in pairs], int)
+    places = {(frozenset((int(geom1), int(geom2))), int(pair)): i for i, (geom1, geom2, pair) in enumerate(every)}
+    index = np.array([places[frozenset((pair.geom1, pair.geom2)), pair.explicit] for pair in pairs], int)
     for name, shape in (("solref", (0, 2)), ("solimp", (0, 5)), ("friction", (0, 5)), ("includemargin", (0,))):
         of_groups = [getattr(contact, name) for contact in groups.values()]
         yield jnp.concatenate([jnp.zeros(shape, model.geom_solref.dtype), *of_groups])[index]
