@@ -141,7 +141,7 @@ def digest(value: Any) -> tuple:
         raise _UnknownError
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         return "key", str(value.dtype), *digest(jax.random.key_data(value))
-    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    content = hashlib.sha256(np.ascontiguousarray(value).reshape(-1).view(np.uint8)).hexdigest()
     return str(value.dtype), value.shape, getattr(value, "weak_type", False), content
 
 
