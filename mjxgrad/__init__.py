@@ -1,7 +1,7 @@
 """mjxgrad: differentiable rollouts on MuJoCo MJX whose gradients can be trusted, and a measure of how far."""
 
 from mjxgrad import _mjx  # isort: skip
-from mjxgrad import baselines, diagnostics, envs, estimators, identification, learning, planning, tasks
+from mjxgrad import _interrupts, baselines, diagnostics, envs, estimators, identification, learning, planning, tasks
 from mjxgrad._programs import keep_compiled
 from mjxgrad.batched import over_devices
 from mjxgrad.bodies import set_const
@@ -16,6 +16,7 @@ from mjxgrad.scene import Scene, load_scene, sensor, site_position
 from mjxgrad.stepping import Discrete, Onset, Slope, Smoothing, contact_force, forward, solve, step
 
 _mjx.imported()
+_interrupts.lose_none()
 linearize, optimize = linearise, optimise  # as the field spells them
 
 __all__ = [

@@ -1,6 +1,5 @@
 """Compiled programs, kept within a process and from one process to the next."""
 
-import atexit
 import collections
 import functools
 import hashlib
@@ -9,11 +8,9 @@ import os
 import platform
 import sys
 import sysconfig
-import threading
 import types
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._warnings import STOPPED
+from mjxgrad._interrupts import patiently
 
 _Function = TypeVar("_Function", bound=Callable)
 _INSTALLED = (*(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")), str(Path(__file__).parent))
@@ -141,7 +138,7 @@ def digest(value: Any) -> tuple:
         raise _UnknownError
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
         return "key", str(value.dtype), *digest(jax.random.key_data(value))
-    content = hashlib.sha256(np.ascontiguousarray(value).reshape(-1).view(np.uint8)).hexdigest()
+    content = hashlib.sha256(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data).hexdigest()
     return str(value.dtype), value.shape, getattr(value, "weak_type", False), content
 
 
@@ -176,43 +173,6 @@ def compiled(function: _Function) -> _Function:
         return program(form, [x.astype(x.dtype) if getattr(x, "weak_type", False) else x for x in leaves])
 
     return call  # pyright: ignore[reportReturnType]
-
-
-def patiently(call: Callable[[], Any]) -> Any:
-    """Return what a call returns, in another thread, so that Ctrl-C ends the wait while a program of C++ runs on.
-
-    The call has most of a second to end; Python functions that it calls give up at once.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return call()
-    found, is_double = Future(), jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-
-    def work() -> None:
-        try:
-            with jax.enable_x64(is_double):  # a thread does not see settings made by `with`
-                found.set_result(call())
-        except BaseException as error:
-            found.set_exception(error)
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        return found.result()
-    except KeyboardInterrupt:
-        STOPPED.set()
-        thread.join(0.7)
-        STOPPED.clear()
-        atexit.register(_leave, thread)
-        raise
-
-
-def _leave(thread: threading.Thread) -> None:
-    """End the process where C++ goes on in an abandoned thread, which Python would wait for or tear out with a crash."""
-    atexit.unregister(_leave)
-    if thread.is_alive():
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        os._exit(130)
 
 
 _KEPT: collections.OrderedDict[Any, jax.stages.Compiled] = collections.OrderedDict()

@@ -1,4 +1,4 @@
-"""C MuJoCo's warnings, which it would write to the terminal and to a file in the current folder; and Ctrl-C while it works.
+"""C MuJoCo's warnings, which it would write to the terminal and to a file in the current folder.
 
 It has one handler for all threads. A thread that took the handler away while another steps would let that one call nothing.
 """
@@ -6,34 +6,13 @@ It has one handler for all threads. A thread that took the handler away while an
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from typing import TypeVar
+from collections.abc import Iterator
 
 import mujoco
 
-_Found = TypeVar("_Found")
-STOPPED = threading.Event()
-"""Set for a moment after Ctrl-C: what a program calls back should give up."""
 _LOCK = threading.Lock()
 _LISTENERS: list[tuple[int, deque[str]]] = []  # each with its thread
 _FORMER: list = []  # the handler of whoever came before
-
-
-def give_up_if_stopped() -> None:
-    """Raise a KeyboardInterrupt where Ctrl-C has ended what waits for this; work in pieces asks between them."""
-    if STOPPED.is_set():
-        raise KeyboardInterrupt
-
-
-def finished(call: Callable[[], _Found]) -> _Found:
-    """Return what a call returns, also where Ctrl-C comes while it works: it begins once more.
-
-    It is for the last seconds of a long measurement, which would else be lost with all before.
-    """
-    try:
-        return call()
-    except KeyboardInterrupt:
-        return call()
 
 
 @contextlib.contextmanager

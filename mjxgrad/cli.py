@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from mjxgrad._interrupts import COMES_AGAIN, finished
 from mjxgrad._text import write
-from mjxgrad._warnings import finished
 
 try:
     import cyclopts
@@ -48,6 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
     interruptions: list[float] = []
 
     def interrupt(*_: Any) -> None:
+        if COMES_AGAIN.is_set():
+            COMES_AGAIN.clear()
+            raise KeyboardInterrupt
         is_first, now = not interruptions, time.monotonic()
         if not is_first and now - interruptions[0] < _ONE:
             return

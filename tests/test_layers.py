@@ -17,7 +17,7 @@ import mjxgrad
 ROOT = Path(mjxgrad.__file__).parent
 # Each line may import those above it; parts of one line do not know each other.
 ORDER = (
-    ("_arrays", "_mjx", "_text", "_warnings", "report"),
+    ("_arrays", "_interrupts", "_mjx", "_text", "_warnings", "report"),
     ("_programs",),
     ("batched",),
     ("bodies",),

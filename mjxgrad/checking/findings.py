@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjxgrad._programs import patiently
+from mjxgrad._interrupts import patiently
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import STDDEVS, Measured, Slope, nearest, slopes
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of

@@ -29,9 +29,9 @@ from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from mjxgrad._arrays import function, one_key, whole
+from mjxgrad._interrupts import finished
 from mjxgrad._programs import compile_once
 from mjxgrad._text import Printed, aligned, format_number
-from mjxgrad._warnings import finished
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjxgrad._warnings import give_up_if_stopped
+from mjxgrad._interrupts import give_up_if_stopped
 from mjxgrad.engines import inverse
 from mjxgrad.engines.events import HAIR, Events, Near, Surfaces, clearance, undecided
 from mjxgrad.engines.flight import FIRST, PAIRS, Begun

@@ -22,7 +22,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjxgrad._warnings import give_up_if_stopped
+from mjxgrad._interrupts import give_up_if_stopped
 
 # Packages as they are without what they import, which is JAX.
 _START = """

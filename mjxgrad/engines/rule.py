@@ -19,7 +19,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from mjxgrad._warnings import give_up_if_stopped
+from mjxgrad._interrupts import give_up_if_stopped
 from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.engines.flight import NUM_SLOTS, PAIRS, advance, begin
 from mjxgrad.engines.jacobians import with_pairs

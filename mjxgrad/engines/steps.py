@@ -5,7 +5,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad._warnings import give_up_if_stopped
+from mjxgrad._interrupts import give_up_if_stopped
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
 
 START = ("time", *MOTION)

@@ -25,7 +25,8 @@ from jax.experimental.multihost_utils import sync_global_devices
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 from mjxgrad._arrays import function, instance
-from mjxgrad._programs import Form, digest, parted, patiently
+from mjxgrad._interrupts import patiently
+from mjxgrad._programs import Form, digest, parted
 from mjxgrad._text import duration, write
 from mjxgrad.batched.device import all_devices
 

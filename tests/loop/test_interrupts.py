@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjxgrad import _interrupts, cli
 from mjxgrad.loop import Method, run
 
 PAUSE = 0.1  # s
@@ -62,3 +64,29 @@ def test_ctrl_c_before_any_step_is_one():
 def test_a_short_run_says_nothing(capfd):
     run(Slow(), jnp.zeros(()), num_steps=3, segment=2)
     assert capfd.readouterr().err == ""
+
+
+class Lost:
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("within_command", [False, True])
+def test_ctrl_c_that_python_ignores_comes_again(monkeypatch, within_command, capfd):
+    """As in JAX's function that garbage collection calls: a run of learning went on for ever."""
+    monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
+    _interrupts.lose_none()
+
+    def work():
+        del [Lost()][0]
+        time.sleep(5)
+
+    began = time.perf_counter()
+    if within_command:
+        monkeypatch.setattr(cli, "app", lambda *_, **__: work())
+        assert cli.main([]) == 130
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    assert time.perf_counter() - began < 2
+    assert "ignored" not in capfd.readouterr().err
