@@ -10,8 +10,6 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
-import jax
-
 _Found = TypeVar("_Found")
 STOPPED = threading.Event()
 """Set for a moment after Ctrl-C: what a program calls back should give up."""
@@ -61,6 +59,8 @@ def patiently(call: Callable[[], Any]) -> Any:
 
     The call has most of a second to end; Python functions that it calls give up at once.
     """
+    import jax  # which processes that take derivatives do without
+
     if threading.current_thread() is not threading.main_thread():
         return call()
     found, is_double = Future(), jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]

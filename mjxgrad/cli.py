@@ -141,7 +141,7 @@ def sweep(
     stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
     noise: float = 0.1,
     samples: Whole = 256,
-    gradient: Literal["slope", "discrete"] = "slope",
+    gradient: Literal["slope", "discrete"] | None = None,
     engine: str | None = None,
     seed: Whole = 0,
     html: Path = Path("sweep.html"),
@@ -158,7 +158,7 @@ def sweep(
         stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
         samples: rollouts of each estimate; the truth takes sixteen times as many, without derivatives.
-        gradient: the slope of the outcome, or the discrete one of each step.
+        gradient: the slope of the outcome, or the discrete one of each step; by default the slope, unless it errs twice as much.
         engine: mjx, or mujoco for C MuJoCo, which compiles nothing and takes several times as long; by default the scene's own.
         seed: seed of all random numbers.
         html: the page to write.
@@ -168,7 +168,8 @@ def sweep(
     mg = _library()
     given = {} if stiffness is None else {"stiffness": stiffness}
     given |= {"noise": noise, "num_samples": samples, "num_reference": 16 * samples, "seed": seed, "log": log}
-    given |= {"start": start, "horizon": horizon, "contact": mg.stepping.own_motion(gradient), "engine": engine}
+    given |= {"start": start, "horizon": horizon, "engine": engine}
+    given |= {"contact": mg.stepping.own_motion(gradient) if gradient else None}
     found = mg.sweep(_existing(scene), cost, **given)
     print(finished(lambda: str(found)), flush=True)
     finished(lambda: write(html, found.as_html()))

@@ -25,6 +25,7 @@ from mjxgrad.contact import Softness
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import BATCH, ESTIMATES
 from mjxgrad.engines import ENGINES, QUICK, engine_of
+from mjxgrad.estimators import first_order
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
 from mjxgrad.objective.task import SceneTask
@@ -40,6 +41,7 @@ _ERRORS = f"Error of a gradient from {BATCH} rollouts, by bias and scatter, over
 _UNFELT = 1e-9  # of the cost, gradients that are rounding
 _PAIRS = 256  # pairs of rollouts at once
 _FEW = 8  # numbers of a direction that are printed
+_NEARER = 0.5  # of the slope's error, below which the derivative of each step is taken
 
 
 def scene_task(
@@ -152,6 +154,17 @@ class Knob:
         _ = knob.own, knob.direction  # kept, since a trace does not know them
         return eqx.filter_jit(lambda softness: knob(softness))
 
+    def error(
+        self, contact: Contact, softness: Softness, key: PRNGKeyArray, truth: tuple[np.ndarray, np.ndarray]
+    ) -> float:
+        """Return the error to expect of a first-order gradient from 16 rollouts by C MuJoCo, beside a truth and its error."""
+        objective = self._traced(softness)
+        objective = dataclasses.replace(objective, task=objective.task.with_contact(contact))
+        found = first_order(objective, jnp.zeros(1), key, num_samples=BATCH)
+        variance, (value, error) = float(found.covariance_diagonal[0]), (float(x.item()) for x in truth)
+        bias = max((float(found.value[0]) - value) ** 2 - variance / BATCH - error**2, 0.0)
+        return float(np.nan_to_num(np.sqrt(bias + variance / BATCH), nan=np.inf))
+
     def truth(
         self, softness: Softness, key: PRNGKeyArray, num_rollouts: int
     ) -> tuple[Float[np.ndarray, "1 1"], Float[np.ndarray, "1 1"]]:
@@ -179,6 +192,15 @@ class Knob:
         if kind == "joint":
             return f"the velocity of {which} at the start, with noise of {self.noise:g} on it (m/s, rad/s)"
         return f"a constant added to the control of {which}, with noise of {self.noise:g} in each step; 1 is half its range"
+
+
+def nearer(knob: Knob, softness: Softness, key: PRNGKeyArray, truth: tuple[np.ndarray, np.ndarray]) -> tuple[Knob, str]:
+    """Return the knob with the derivative that errs less, and why, where that is not the slope."""
+    slope, discrete = (knob.error(contact, softness, key, truth) for contact in (Slope(), Discrete()))
+    if discrete >= _NEARER * slope:
+        return knob, ""
+    other = dataclasses.replace(knob, task=knob.task.with_contact(Discrete()))
+    return other, f"; slopes of the outcome err {slope / discrete:.2g} times as much"
 
 
 @dataclass(frozen=True)
@@ -299,7 +321,8 @@ def sweep(
         engine: who steps, see `Scene.with_engine`; by default the scene's own.
         **task_settings: `start`, a key frame with its controls, by default the first, else the reference pose, at rest;
             `horizon`, a number of time steps, by default half a second, but 50 to 300; `contact`, see `rollout`, by default
-            `mg.Slope()`.
+            `mg.Slope()`, or `mg.Discrete()` where slopes scatter so much that it errs less than half as much at the file's
+            own contact.
 
     Raises:
         ValueError: if there is no such file, function, body or key frame, a number is out of range, or nothing that the controls
@@ -317,18 +340,25 @@ def sweep(
     scene = scene if engine is None else scene.with_engine(engine)
     if task_settings.get("start") is None and scene.mj_model.nkey:
         task_settings["start"] = scene.mj_model.key(0).name or 0
+    is_free = task_settings.get("contact") is None
+    task_settings = {k: x for k, x in task_settings.items() if k != "contact" or not is_free}
     task = scene_task(scene, cost, seed=seed, **task_settings)
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
+    why = ""
     if task.num_controls and isinstance(task.contact, Slope | Discrete):
-        few = knob.truth(Softness(stiffness=jnp.asarray(knob.own or swept[0])), jax.random.key(seed), _PAIRS)
+        softness = Softness(stiffness=jnp.asarray(knob.own or swept[0]))
+        few = knob.truth(softness, jax.random.key(seed), _PAIRS)
         if np.abs(few).max() <= _UNFELT * abs(at_rest):
             wanted = "start nearer, at another key frame, or look further ahead, over a longer horizon"
             stays = f"stays {at_rest:.3g} in {_PAIRS} motions under the noise"
             raise ValueError(f"cost must feel the controls, but {stays}: {wanted}")
+        if is_free and scene.pairs:
+            knob, why = nearer(knob, softness, jax.random.key(seed + 1), few)
+            task = knob.task
     given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
     given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
     say, began, last = log or (lambda _: None), [], [0]
@@ -352,6 +382,8 @@ def sweep(
         else:  # nobody knows before how long that takes
             first += f", a minute or several for a robot; engine mujoco would take {whole_price}, and compiles nothing"
     say(f"{what}, by {by.title}; {first}")
+    if why:
+        say(f"derivatives are those of each step{why}")
     result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=progress, **given)
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
@@ -361,7 +393,7 @@ def sweep(
     told = [
         f"Gradient of {called} after {task.horizon} steps, by {knob}.",
         "Swept contacts are critically damped." if scene.pairs else none,
-        f"Derivative: {kind}, by {engine_of(task.scene, contact).title}.",
+        f"Derivative: {kind}, by {engine_of(task.scene, contact).title}{why}.",
     ]
     if exact := touching_exactly(scene, np.asarray(task.state.qpos)):
         told.append(exact_text(exact))

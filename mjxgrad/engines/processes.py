@@ -84,6 +84,7 @@ class Processes:
             with contextlib.suppress(OSError):
                 child.stdin.close()  # pyright: ignore
             child.wait()
+            child.stdout.close()  # pyright: ignore
 
     def share(
         self, key: int, model: mujoco.MjModel, count: int, shapes: Mapping[str, tuple[int, ...]], arguments: Any

@@ -14,7 +14,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad import cli
-from mjxgrad.checking.sweep import Knob, scene_task
+from mjxgrad.checking.sweep import Knob, nearer, scene_task
 from tests.scenes import ASSETS
 
 # A block is pushed against a wall; its time step holds neither 1e6 1/s² (h²k + 2hb = 8) nor more.
@@ -55,6 +55,28 @@ def swept(folder):
         num_reference=512,
         contact=mg.Discrete(),
     )
+
+
+SLED = """<mujoco><option timestep=".005"/><worldbody><geom type="plane" size="9 9 .1"/><body pos="0 0 .0995">
+  <joint name="x" type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+  <geom type="box" size=".2 .1 .1" mass="1"/></body></worldbody>
+  <actuator><motor joint="x" gear="10" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def test_the_derivative_is_the_slope_unless_that_errs_twice_as_much(folder):
+    """Onto a wall each step misses the jump; slopes of a sled follow each hop of its corners, which noise averages over."""
+    hit = scene_task(
+        mg.load_scene(folder / "block.xml", engine="mujoco"), f"{folder}/costs.py:reward", start="near", horizon=40
+    )
+    slide = scene_task(
+        mg.load_scene(SLED, engine="mujoco"), lambda course: (course.qpos[-1, 0] - 0.3) ** 2, horizon=100
+    )
+    for task, expected in ((hit, mg.Slope), (slide, mg.Discrete)):
+        knob = Knob(task, 0.5)
+        softness = mg.Softness(stiffness=jnp.asarray(knob.own))
+        chosen, why = nearer(knob, softness, jax.random.key(1), knob.truth(softness, jax.random.key(0), 256))
+        assert isinstance(chosen.task.contact, expected)
+        assert why.startswith("; slopes of the outcome err") is (expected is mg.Discrete)
 
 
 def test_the_truth_of_a_jump_is_the_noises_density_and_of_a_line_exact(folder):
