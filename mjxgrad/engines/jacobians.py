@@ -117,6 +117,7 @@ class Worker:
             self.given, self.model, self.others = given, copy.deepcopy(given), None
             self.inverse, self.is_explicit = Inverse(self.model, self.layout), inverse.has_inverse(self.model)
             self.sensed = _sensed(self.model)
+            self.placed = (mujoco.mj_kinematics, mujoco.mj_sensorPos) if _are_frames(self.model) else _PLACED
             self.surfaces = Surfaces(self.model, self.levers)
             self.far, self.stepper = mujoco.MjData(self.surfaces.model), Stepper(self.model, self.layout, 1)
         self.surfaces.widen(speeds if gradient == "slope" else 0 * speeds)
@@ -414,7 +415,7 @@ class Worker:
         model, data = self.inverse.model, self.inverse.data
         mujoco.mj_setState(model, data, row, EVERY)
         if self.sensed == _PLACES:
-            for stage in _PLACED:
+            for stage in self.placed:
                 stage(model, data)
         elif self.sensed == _SPEEDS:
             for stage in _MOVED if done == _NONE else _MOVED[2:]:
@@ -528,6 +529,14 @@ def _sensed(model: mujoco.MjModel) -> int | None:
         return None
     stage = model.sensor_needstage.max()
     return int(stage) if stage in (_PLACES, _SPEEDS) else None
+
+
+def _are_frames(model: mujoco.MjModel) -> bool:
+    """Return whether all sensors read joints or frames of bodies, geoms and sites, for which kinematics are enough."""
+    names = ("JOINTPOS", "BALLQUAT", "FRAMEPOS", "FRAMEQUAT", "FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS")
+    frames = [getattr(mujoco.mjtSensor, f"mjSENS_{name}") for name in names]
+    has_cameras = mujoco.mjtObj.mjOBJ_CAMERA in (*model.sensor_objtype, *model.sensor_reftype)
+    return bool(np.isin(model.sensor_type, frames).all()) and not has_cameras
 
 
 def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) -> np.ndarray:

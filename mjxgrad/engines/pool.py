@@ -30,6 +30,7 @@ _NUM_THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") 
 _NUMBERS = itertools.count()  # of pools
 # Other processes take derivatives of so many steps and more, if they take so long (s) here. Their start takes half a second.
 _FEWEST, _SHORT, _LONG = 32, 0.05, 2.0
+_MANY = 512  # readings whose derivatives are worth several processes that there are
 _MOST_NUMBERS = 2e7  # of derivatives that are held at a time, where they are not asked for
 
 _Arrays = Mapping[str, np.ndarray]
@@ -184,17 +185,25 @@ class Pool:
             return (*parts, flight[piece], gradient, wanted)
 
         everything = slice(0, num)
-        if self._is_long(num * steps, lambda: arguments(slice(0, 1)), shapes):
-            try:
-                return processes(self.num_threads).share(self.number, self.mj_model, num, shapes, arguments)
-            except OSError as problem:
-                self.may_share = False
-                warnings.warn(f"derivatives are taken by one process, which is slower: {problem}", stacklevel=2)
+        is_long = self._is_long(num * steps, lambda: arguments(slice(0, 1)), shapes)
+        if is_long and (shared := self._by_processes("write", num, shapes, arguments)):
+            return shared
         found = {name: np.zeros(shape) for name, shape in shapes.items()}
         began = time.perf_counter()
         self.write(found, *arguments(everything))
         self.spent += time.perf_counter() - began
         return found
+
+    def _by_processes(
+        self, method: str, num: int, shapes: Mapping[str, tuple[int, ...]], arguments: Callable[[slice], tuple]
+    ) -> dict[str, np.ndarray] | None:
+        """Return arrays that processes have written by a method of theirs; nothing where one has ended."""
+        try:
+            return processes(self.num_threads).share(self.number, self.mj_model, num, shapes, arguments, method)
+        except OSError as problem:
+            self.may_share = False
+            warnings.warn(f"derivatives are taken by one process, which is slower: {problem}", stacklevel=2)
+            return None
 
     def _is_long(self, count: int, first: Callable[[], tuple], shapes: Mapping[str, tuple[int, ...]]) -> bool:
         """Return whether several processes should take so many steps, by the time that a first one takes."""
@@ -263,15 +272,26 @@ class Pool:
         with self.lock, collected():
             batch, numbers, states, inputs = self._flat(np.ndim(states["time"]) - 2, numbers, states, inputs)
             num, times = inputs["ctrl"].shape[:2]
-            models = self._models(numbers, num)
             sizes = {k: math.prod(v.shape[2:]) for k, v in inputs.items()} | {"state": self.layout.num_changes}
             sizes |= {k: math.prod(v.shape[1:]) for k, v in numbers.items()}
             count = self.mj_model.nsensordata
-            shapes = {name: (count, sizes[name]) for name in wanted} or {"readings": (count,)}
-            found = {name: np.zeros((num * times, *shape)) for name, shape in shapes.items()}
-            work = self._work(models, states, inputs, "discrete", found)
-            self._share(lambda worker, piece: worker.sense(work, piece), self.workers, num * times)
-        return {name: value.reshape(*batch, times, *value.shape[1:]) for name, value in found.items()}
+            shapes = {name: (num, times, count, sizes[name]) for name in wanted} or {"readings": (num, times, count)}
+            parts = lambda piece: tuple(_part(piece, num, one) for one in (numbers, states, inputs))  # noqa: E731
+            is_long = wanted and num * times >= _MANY and are_started() and self.may_share and are_possible()
+            found = self._by_processes("write_sensed", num, shapes, parts) if is_long else None
+            if found is None:
+                found = {name: np.zeros(shape) for name, shape in shapes.items()}
+                self.write_sensed(found, *parts(slice(0, num)))
+        return {name: value.reshape(*batch, *value.shape[1:]) for name, value in found.items()}
+
+    def write_sensed(self, found: Mapping[str, np.ndarray], numbers: _Arrays, states: _Arrays, inputs: _Arrays) -> None:
+        """Write readings, or their derivatives, into arrays of zeros."""
+        num, times = inputs["ctrl"].shape[:2]
+        flat = {k: v.reshape(num * times, *v.shape[2:]) for k, v in found.items()}
+        work = self._work(self._models(numbers, num), states, inputs, "discrete", flat)
+        # Derivatives are many short calls, which two threads of Python make half as fast as one.
+        workers = self.workers if "readings" in found else self.workers[:1]
+        self._share(lambda worker, piece: worker.sense(work, piece), workers, num * times)
 
     def product(self, numbers: _Arrays, start: _Arrays, inputs: _Arrays, *, gradient: str) -> dict[str, np.ndarray]:
         """Return the derivative of the end of a motion by its start and by controls that are held, and "end", the state there."""
@@ -405,7 +425,7 @@ class Pool:
         return self.exact[1]
 
     def _share(self, work: Callable, workers: list, count: int) -> None:
-        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(self.num_threads, count))]
+        pieces = [piece.tolist() for piece in np.array_split(np.arange(count), min(len(workers), count))]
         list(map(work, workers, pieces) if len(pieces) == 1 else self.threads.map(work, workers, pieces))
 
     def _flat(self, ndim: int, numbers: _Arrays, *arrays: _Arrays) -> tuple:

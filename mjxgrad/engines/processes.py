@@ -87,12 +87,13 @@ class Processes:
             child.stdout.close()  # pyright: ignore
 
     def share(
-        self, key: int, model: mujoco.MjModel, count: int, shapes: Mapping[str, tuple[int, ...]], arguments: Any
-    ) -> dict[str, np.ndarray]:
-        """Return so many rows of these arrays of doubles, whose pieces `Pool.write` has written.
+        self, key: int, model: mujoco.MjModel, count: int, shapes: Mapping[str, tuple[int, ...]], arguments: Any,
+        method: str = "write",
+    ) -> dict[str, np.ndarray]:  # fmt: skip
+        """Return so many rows of these arrays of doubles, whose pieces a method of `Pool` has written.
 
         A process makes a pool of its own where it does not know the key. `arguments` is a function from a slice to what
-        `Pool.write` takes beside arrays.
+        the method takes beside arrays.
 
         Raises:
             OSError: a process has ended.
@@ -104,7 +105,7 @@ class Processes:
             def work(child: int) -> None:
                 for piece in pieces:
                     give_up_if_stopped()
-                    self._ask(child, key, model, (path, shapes, piece, arguments(piece)))
+                    self._ask(child, key, model, (path, shapes, piece, method, arguments(piece)))
 
             list(self.threads.map(work, range(len(self.children))))
         return found
@@ -138,7 +139,7 @@ def serve() -> None:
     pools: dict[int, Pool] = {}
     while True:
         try:
-            key, model, (path, shapes, piece, arguments) = pickle.load(asked)
+            key, model, (path, shapes, piece, method, arguments) = pickle.load(asked)
         except EOFError:
             return
         error = None
@@ -147,7 +148,7 @@ def serve() -> None:
                 _remember(pools, key, Pool(pickle.loads(model), num_threads=1))
             with Path(path).open("r+b") as file:
                 found = _arrays(mmap.mmap(file.fileno(), 0), shapes)
-            pools[key].write({name: value[piece] for name, value in found.items()}, *arguments)
+            getattr(pools[key], method)({name: value[piece] for name, value in found.items()}, *arguments)
         except Exception as problem:
             error = problem
         try:

@@ -11,8 +11,9 @@ from mjxgrad.engines.processes import Processes, are_possible
 from tests.processes import run_python
 
 BALL = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1"><freejoint/><geom size=".1" mass="1"/></body>
-    <body pos="1 0 1"><joint name="j" axis="0 1 0" damping=".1"/><geom type="capsule" fromto="0 0 0 0 0 -.9" size=".05"/></body>
-    </worldbody><actuator><motor joint="j"/></actuator></mujoco>"""
+    <body name="arm" pos="1 0 1"><joint name="j" axis="0 1 0" damping=".1"/><geom type="capsule" fromto="0 0 0 0 0 -.9"
+    size=".05"/></body></worldbody><actuator><motor joint="j"/></actuator>
+    <sensor><framepos objtype="body" objname="arm"/></sensor></mujoco>"""
 _NUM, _STEPS = 6, 40
 
 
@@ -21,7 +22,13 @@ def other():
     """Processes of this test's own, which take all that is asked for."""
     with pytest.MonkeyPatch.context() as patch:
         own = Processes(2)
-        for name, value in (("_FEWEST", 1), ("_SHORT", 0.0), ("_LONG", 0.0), ("processes", lambda _: own)):
+        for name, value in (
+            ("_FEWEST", 1),
+            ("_SHORT", 0.0),
+            ("_LONG", 0.0),
+            ("_MANY", 1),
+            ("processes", lambda _: own),
+        ):
             patch.setattr(pools, name, value)
         yield own
         own.close()
@@ -56,6 +63,24 @@ def test_they_are_those_of_threads(gradient, wanted, other):
         np.testing.assert_allclose(found[name], value, rtol=1e-9, atol=1e-9 * np.abs(value).max(), err_msg=name)
 
 
+def test_readings_have_the_derivatives_of_threads(other, monkeypatch):
+    model, random = mujoco.MjModel.from_xml_string(BALL), np.random.default_rng(0)
+    states = {"time": np.zeros((_NUM, 3, 1)), "act": np.zeros((_NUM, 3, 0))}
+    states |= {"qpos": np.tile(model.qpos0, (_NUM, 3, 1)), "qvel": random.normal(size=(_NUM, 3, model.nv))}
+    states["qpos"][..., -1] = random.normal(size=(_NUM, 3))
+    both, asked = [], []
+    monkeypatch.setattr(other, "_ask", lambda *given, ask=other._ask: (asked.append(given), ask(*given)))
+    for is_started in (True, False):
+        monkeypatch.setattr(pools, "are_started", lambda is_started=is_started: is_started)
+        pool, inputs = Pool(model, num_threads=2), {"ctrl": np.zeros((_NUM, 3, 1))}
+        both.append(pool.sense({}, states, inputs, wanted=("state", "ctrl")))
+    assert asked
+    for name, value in both[1].items():
+        np.testing.assert_array_equal(both[0][name], value)
+    # The arm's centre is 0.45 m from its joint.
+    np.testing.assert_allclose(both[0]["state"][..., 0, 6], -0.45 * np.cos(states["qpos"][..., -1]), atol=1e-9)
+
+
 def test_where_one_has_ended_threads_go_on(other):
     for child in other.children:
         child.kill()
@@ -75,7 +100,9 @@ def test_what_a_process_says_is_raised(other):
 
 def test_one_whose_parent_was_killed_ends_in_silence():
     ask = "import os, pickle; from mjxgrad.engines.processes import Processes; child = Processes(1).children[0]; "
-    ask += "pickle.dump((0, None, ('nowhere', {}, slice(0), ())), child.stdin); child.stdin.flush(); os._exit(0)"
+    ask += (
+        "pickle.dump((0, None, ('nowhere', {}, slice(0), 'write', ())), child.stdin); child.stdin.flush(); os._exit(0)"
+    )
     assert run_python("-c", ask) == ("", "")  # waits until the child has closed its output
 
 
