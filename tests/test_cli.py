@@ -160,7 +160,13 @@ def test_a_signal_that_is_sent_twice_at_once_is_one(scene, capsys, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is former
 
 
-@pytest.mark.parametrize("signals_sent", [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
+@pytest.mark.parametrize(
+    "signals_sent",
+    [
+        [signal.SIGINT],
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ([signal.SIGTERM], [signal.SIGINT, signal.SIGINT])),
+    ],
+)
 def test_a_signal_within_a_long_computation_ends_the_process_within_a_second_or_two(tmp_path, signals_sent):
     """A sweep that would take many minutes, at its first progress; the answer so far is printed and the page written."""
     (tmp_path / "scene.xml").write_text(SCENE.format(gear=1))
