@@ -237,7 +237,8 @@ def price_finding(prices: Mapping[str, float], found: Sequence[Slope], horizon: 
     )
     if found and found[0].errors.size and slope > discrete and nearest(found, slope / discrete) == "discrete":
         text += f". The slope costs {slope / discrete:.2g} times as much and is no nearer beyond doubt"
-    return Finding("price", f"{text}.")
+    more = "Over many more steps slopes may scatter: mjxgrad sweep with your --horizon tells which derivative errs less"
+    return Finding("price", f"{text}. {more}.")
 
 
 def _is_far(found: Sequence[Slope]) -> bool:
