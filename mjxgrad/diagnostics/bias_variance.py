@@ -33,7 +33,7 @@ from mjxgrad._interrupts import finished
 from mjxgrad._programs import compile_once
 from mjxgrad._text import Printed, aligned, format_number
 from mjxgrad.contact import Softness
-from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, mean_interval
+from mjxgrad.diagnostics.statistics import bootstrap_variance_interval, checked, mean_interval
 from mjxgrad.estimators.estimate import GradientEstimate
 from mjxgrad.estimators.first_and_zeroth import both_results, both_summary
 from mjxgrad.estimators.mixture import both_parts, weigh
@@ -328,6 +328,7 @@ def bias_variance(
             f"params must have shape (points, dim), got {jnp.shape(params)}; for one parameter params[:, None]"
         )
     params = jnp.asarray(params)
+    checked(confidence)  # before hours of work
     whole("num_reference", num_reference, 4)
     function("progress", progress, "done", "total")
     one_key(key)

@@ -209,6 +209,18 @@ def test_an_interruption_leaves_some_rollouts_of_each_softness_and_waits_for_non
     np.testing.assert_array_less(np.abs(table.zeroth.value[..., 0] - exact), 4 * table.zeroth.standard_error[..., 0])
 
 
+def test_a_confidence_out_of_range_is_refused_before_the_work():
+    with pytest.raises(ValueError, match="confidence must be between 0 and 1"):
+        bias_variance(
+            lambda _: pytest.fail("measured"),
+            POINTS,
+            jax.random.key(0),
+            softness=WIDTHS,
+            num_samples=400,
+            confidence=95.0,
+        )
+
+
 def test_an_interruption_at_the_very_end_loses_nothing(monkeypatch):
     """While intervals are taken, after all rollouts."""
     own, sent = bootstrap_variance_interval, []
