@@ -46,6 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     interruption. An interrupted command first prints and writes what it has measured, if anything.
     """
     interruptions: list[float] = []
+    COMES_AGAIN.clear()  # of the program that calls a command
 
     def interrupt(*_: Any) -> None:
         if COMES_AGAIN.is_set():

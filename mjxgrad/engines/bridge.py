@@ -1,6 +1,5 @@
 """Steps of MuJoCo Warp as operations of JAX: what worlds are given goes in, what is wanted comes out, the rest stays."""
 
-import collections
 import copy
 import dataclasses
 import logging
@@ -86,7 +85,7 @@ class Program:
         return part.reshape(len(part) * len(like), *like.shape[1:])
 
     def _operation(self, names: tuple[str, ...]) -> Callable[[Array], Array]:
-        warp, stores = self._warp, collections.OrderedDict()
+        warp, stores = self._warp, {}
         run = lambda given, found: self._run(names, stores, given, found)  # noqa: E731
         run.__annotations__ = {name: warp.array(dtype=float, ndim=2) for name in ("given", "found")}  # pyright: ignore
         # Warp would capture a graph for each call of a program; one for each number of worlds is enough.
