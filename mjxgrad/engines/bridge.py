@@ -150,11 +150,13 @@ class _Store:
         if not device.is_cuda:
             self._launch()
             return
-        if self._graph is None:
-            with self._warp.ScopedCapture(device) as capture:
-                self._launch()
-            self._graph = capture.graph
-        self._warp.capture_launch(self._graph)
+        if self._graph is not None:
+            self._warp.capture_launch(self._graph)
+            return
+        self._launch()  # loads the kernels, which a capture does not
+        with self._warp.ScopedCapture(device) as capture:
+            self._launch()
+        self._graph = capture.graph
 
     def _launch(self) -> None:
         self._data.overflow.zero_()
