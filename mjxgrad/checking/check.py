@@ -26,7 +26,7 @@ from mjxgrad.batched import device
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Line, Measured, Noise, measure, slopes
+from mjxgrad.checking.measure import Line, Measured, Noise, measure, seconds_by_engine, slopes
 from mjxgrad.checking.motions import (
     Motions,
     Mover,
@@ -37,7 +37,7 @@ from mjxgrad.checking.motions import (
     seconds_of,
 )
 from mjxgrad.diagnostics.stability import StabilityReport, check_stability
-from mjxgrad.engines import QUICK
+from mjxgrad.engines import ENGINES, QUICK
 from mjxgrad.objective.task import as_pytree, checked_cost
 from mjxgrad.report import INK, Block, page, svg
 from mjxgrad.scene import Scene, SceneWarning, load_scene
@@ -209,6 +209,11 @@ def check(
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
     price = prices["slope"] / prices["discrete"] if prices else math.inf
     advice = findings.recommend(motions, stability, measured, slots, price)
+    if prices and not device.is_cpu():
+        seconds = seconds_by_engine(scene, ENGINES, say)
+        if seconds:
+            advice = dataclasses.replace(advice, engine=min(seconds, key=lambda engine: seconds[engine][1]))
+            found.append(findings.engine_prices_finding(seconds))
     told = slopes(measured.lines) if measured else ()
     if prices:
         prices = {kind: advice.horizon * seconds for kind, seconds in prices.items()}
@@ -278,8 +283,8 @@ def _noise_text(noise: Noise) -> str:
 
 def _setup(scene: Scene, advice: Recommendation, path: str, more: str = "") -> str:
     """Return the beginning of a program with the recommended settings, up to its start and its task."""
-    # On GPUs MJX is faster; elsewhere what compiles nothing.
-    engine = QUICK if device.is_cpu() else None
+    # On GPUs what was fastest; elsewhere what compiles nothing.
+    engine = QUICK if device.is_cpu() else advice.engine
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts, "engine": engine}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:

@@ -12,13 +12,14 @@ import numpy as np
 
 from mjxgrad._interrupts import patiently
 from mjxgrad._text import format_number, name_pairs
-from mjxgrad.checking.measure import STDDEVS, Measured, Slope, nearest, slopes
+from mjxgrad.checking.measure import NUM_COMPARED, STDDEVS, STEPS_COMPARED, Measured, Slope, nearest, slopes
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.engines import ENGINES
 from mjxgrad.engines.state import LARGEST_GROWTH
 from mjxgrad.rollouts import rollout
 from mjxgrad.scene import Scene, SceneError, load_scene
+from mjxgrad.stepping import EngineName
 
 _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
@@ -56,6 +57,7 @@ class Recommendation:
         timestep: time step in s; None, here and below, keeps the file's.
         stiffness: stiffness of all contacts, in 1/s².
         max_contacts: number of contact slots.
+        engine: who steps a batch soonest; None is the scene's own.
     """
 
     gradient: str
@@ -65,6 +67,7 @@ class Recommendation:
     timestep: float | None = None
     stiffness: float | None = None
     max_contacts: int | None = None
+    engine: EngineName | None = None
 
 
 def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) -> Iterator[Finding]:
@@ -239,6 +242,16 @@ def price_finding(prices: Mapping[str, float], found: Sequence[Slope], horizon: 
         text += f". The slope costs {slope / discrete:.2g} times as much and is no nearer beyond doubt"
     more = "Over many more steps slopes may scatter: mjxgrad sweep with your --horizon tells which derivative errs less"
     return Finding("price", f"{text}. {more}.")
+
+
+def engine_prices_finding(seconds: Mapping[EngineName, tuple[float, float]]) -> Finding:
+    """Return what gradients cost by each engine, the fastest first."""
+    ordered = sorted(seconds, key=lambda engine: seconds[engine][1])
+    told = [
+        f"{seconds[one][1]:.2g} s by {ENGINES[one].title} (the first time {seconds[one][0]:.2g} s)" for one in ordered
+    ]
+    text = f"{NUM_COMPARED} discrete gradients of {STEPS_COMPARED} steps side by side take {', '.join(told)}"
+    return Finding("engine_prices", f"{text}.")
 
 
 def _is_far(found: Sequence[Slope]) -> bool:

@@ -4,7 +4,7 @@ import contextlib
 import functools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
 
+from mjxgrad._interrupts import patiently
 from mjxgrad._text import format_number
 from mjxgrad.checking.motions import (
     KINDS,
@@ -31,8 +32,9 @@ from mjxgrad.checking.motions import (
 from mjxgrad.contact import Softness
 from mjxgrad.diagnostics.jumps import Jumps, jumps_along
 from mjxgrad.diagnostics.slope import SlopeComparison, compare_to_slope, phases
-from mjxgrad.rollouts import State
-from mjxgrad.scene import Scene
+from mjxgrad.rollouts import State, initial_state, rollout
+from mjxgrad.scene import Scene, SceneError
+from mjxgrad.stepping import Discrete, EngineName
 
 _TEETH = 6  # number of time steps by which the first touch moves from the middle of a line to its end
 _SPEED_SHARE, _CONTROL_SHARE = 0.2, 0.2  # share of the approach speed, and of half the control range
@@ -53,6 +55,8 @@ CLOSE = 0.05
 """Largest expected error of a derivative that counts as the slope."""
 _AT_REST = 1e-3  # share of the largest variation at any time
 _UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
+NUM_COMPARED, STEPS_COMPARED = 256, 20
+"""Gradients side by side, and their steps, by which engines are compared."""
 _BESIDE = 0.05  # share of half a line beyond the jumps, where touching pairs are compared
 _REFINEMENTS = 2  # a rise within 1/5000 of the line is a jump: a hundred samples would miss it
 
@@ -142,6 +146,32 @@ def nearest(found: Sequence[Slope], price: int | float = np.inf) -> Kind:
     # In standard errors: a slope of four times the price or more must be nearer by two. A bias costs more than time does.
     needed = 1.0 if not np.isfinite(price) else np.clip(np.log2(price), 0.0, 2.0)
     return "slope" if gains.mean() > needed * gains.std() / np.sqrt(gains.size) else "discrete"
+
+
+def seconds_by_engine(
+    scene: Scene, engines: Iterable[EngineName], say: Callable[[str], None]
+) -> dict[EngineName, tuple[float, float]]:
+    """Return how long the first and a later call of many discrete gradients take, by each engine that steps the scene."""
+    found: dict[EngineName, tuple[float, float]] = {}
+    home, nu = jnp.asarray(scene.data.ctrl), scene.model.nu
+    draws = jax.random.normal(jax.random.key(0), (NUM_COMPARED, STEPS_COMPARED, nu), home.dtype)
+    controls = home + 0.1 * jnp.asarray(half_range(scene), home.dtype) * draws
+
+    def gradients(stepped: Scene) -> Callable:
+        ends = lambda c: rollout(stepped, initial_state(stepped), c, contact=Discrete()).qpos[-1].sum()  # noqa: E731
+        return jax.jit(jax.vmap(jax.grad(ends)))
+
+    for engine in engines:
+        say(
+            f"measuring {NUM_COMPARED} gradients by {engine}, which may compile for a minute or more; Ctrl-C leaves it out"
+        )
+        with contextlib.suppress(SceneError, KeyboardInterrupt):
+            compute, began = gradients(scene.with_engine(engine)), time.perf_counter()
+            patiently(lambda compute=compute: jax.block_until_ready(compute(controls)))
+            first, again = time.perf_counter() - began, time.perf_counter()
+            patiently(lambda compute=compute: jax.block_until_ready(compute(controls + 0)))
+            found[engine] = first, time.perf_counter() - again
+    return found
 
 
 @dataclass(frozen=True)

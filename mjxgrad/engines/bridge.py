@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import logging
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -11,8 +10,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array
-
-from mjxgrad.scene import SceneError
 
 NUMBER = "model."
 """What the names of the model's numbers begin with that are not those of its file."""
@@ -40,16 +37,12 @@ class Program:
         import warp
         from mujoco.mjx.third_party import mujoco_warp
 
-        warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # a library must not print
         self._mj_model, self._room, self._warp, self._mjw = mj_model, room, warp, mujoco_warp
         self._function = getattr(mujoco_warp, function)
         self._models: dict[str, Any] = {}
         self._operations: dict[tuple[str, ...], Callable[[Array], Array]] = {}
         with warp.ScopedDevice("cpu"):
-            try:
-                data, self._own = self._data(1), self._model()
-            except (NotImplementedError, RuntimeError) as error:
-                raise SceneError(f"MuJoCo Warp cannot step it: {error}") from error
+            data, self._own = self._data(1), self._model()
         self.bytes_each = sum(x.capacity for part in (data, data.efc, data.contact) for x in _arrays(part))
         self._wanted = {name: _get(data, name).numpy() for name in wanted}
         self._sizes = {name: _flat(warp, _get(data, name), 1).shape[1] for name in self._wanted}

@@ -17,13 +17,13 @@ import numpy as np
 from mjxgrad._arrays import instance, one_of, real, whole
 from mjxgrad._mjx import MJX_VERSION, counts, geom_pairs, make_efc_address, make_efc_type, mjx
 from mjxgrad._warnings import collected
-from mjxgrad.batched.device import own_device
+from mjxgrad.batched.device import is_gpu, own_device
 from mjxgrad.contact import Softness, softness_warnings
 from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import conversions as rules
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
-from mjxgrad.scene.scene import OF_FILES, Scene, SceneError, SceneWarning, check_engine, numbers_of
+from mjxgrad.scene.scene import OF_FILES, Scene, SceneError, SceneWarning, check_engine, numbers_of, takes_warp
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
@@ -43,7 +43,8 @@ def load_scene(
 ) -> Scene:
     """Load a scene, convert what MJX lacks and leave out what the scene does not need.
 
-    C MuJoCo steps a scene that MJX cannot, with derivatives, too: see `scene.engine`, and `scene.unsupported` for the reason.
+    C MuJoCo steps a scene that MJX cannot, with derivatives, too, or on a GPU MuJoCo Warp, where it is installed: see
+    `scene.engine`, and `scene.unsupported` for the reason.
 
     Arrays are float64 if `jax_enable_x64` is set. Float32 otherwise raises a solver tolerance below 1e-6, which the solver
     would never reach.
@@ -94,7 +95,9 @@ def load_scene(
         model = model.tree_replace({"opt.solver": mujoco.mjtSolver.mjSOL_PGS, **touching})
     if nothing := [field for field, value in numbers_of(model).items() if np.isnan(value).any()]:  # pyright: ignore[reportArgumentType]
         raise SceneError(f"{name} must hold numbers, got NaN in {', '.join(nothing)}")
-    chosen = engine if engine == "warp" else None
+    # What MJX lacks, a GPU steps by Warp, in single precision alone.
+    is_for_warp = engine is None and bool(unsupported) and is_gpu() and jnp.result_type(float) == jnp.float32
+    chosen = "warp" if engine == "warp" or (is_for_warp and takes_warp(mj_model)) else None
     scene = Scene(
         model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported, chosen, max_contacts  # pyright: ignore[reportArgumentType]
     )  # fmt: skip
@@ -103,7 +106,11 @@ def load_scene(
     head, *more = unsupported.splitlines() or [""]
     alone = head.removeprefix(f"{name} cannot be stepped by MJX: ")
     reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [alone])
-    messages += [f"C MuJoCo steps it: {reasons}; see scene.unsupported"] if unsupported and engine is None else []
+    messages += (
+        [f"{OF_FILES[scene.engine]} steps it: {reasons}; see scene.unsupported"]
+        if unsupported and engine is None
+        else []
+    )
     if not unsupported:
         messages += [text.partition("; load")[0] for text in refusal_messages(mj_model, [UNLIKE, UNDECIDED])]
     messages += [f"{c.what}: {c.used} instead of {c.given}: {c.reason}" for c in conversions if not c.exact]

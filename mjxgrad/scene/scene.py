@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import importlib.util
+import logging
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
@@ -254,13 +255,31 @@ def numbers_of(model: mjx.Model) -> dict[str, Array]:
 
 
 def check_engine(engine: EngineName | None, mj_model: mujoco.MjModel) -> None:
-    """Refuse MuJoCo Warp where NVIDIA Warp is missing, and what a rollout by it does not carry from step to step."""
+    """Refuse MuJoCo Warp where NVIDIA Warp is missing, or what it does not step."""
     if engine != "warp":
         return
     if importlib.util.find_spec("warp") is None:
         raise SceneError("engine='warp' needs NVIDIA Warp: pip install 'mjxgrad[warp]'")
-    if mj_model.nhistory:
+    if mj_model.nhistory:  # a rollout does not carry them from step to step
         raise SceneError("engine='warp' carries no delays of actuators or sensors: take engine='mujoco'")
+    import warp
+    from mujoco.mjx.third_party import mujoco_warp
+
+    warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # a library must not print
+    try:
+        with warp.ScopedDevice("cpu"):
+            mujoco_warp.put_model(mj_model)
+    except (NotImplementedError, RuntimeError, ValueError) as error:
+        raise SceneError(f"engine='warp' cannot step it: {error}; take engine='mujoco'") from error
+
+
+def takes_warp(mj_model: mujoco.MjModel) -> bool:
+    """Return whether MuJoCo Warp is there, and steps a model."""
+    try:
+        check_engine("warp", mj_model)
+    except SceneError:
+        return False
+    return True
 
 
 def changed_numbers(scene: "Scene") -> dict[str, Array]:

@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import itertools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.batched import device
 from mjxgrad.engines import worlds
-from mjxgrad.scene import SceneError
+from mjxgrad.scene import SceneError, load
+from mjxgrad.scene.scene import SceneWarning
 from tests.engines.test_derivative import SCENES
 from tests.engines.whole_steps import by_whole_steps
 
@@ -167,3 +170,31 @@ def test_what_warp_lacks_is_said():
     slow = CART.replace('gear="5"', 'gear="5" delay="0.05" nsample="8"')
     with pytest.raises(SceneError, match="carries no delays"):
         mg.load_scene(slow, engine="warp")
+
+
+TETRAHEDRON = """<mujoco><asset><mesh name="t" vertex="0 0 0 .2 0 0 0 .2 0 0 0 .2"/></asset><worldbody>
+    <geom type="plane" size="1 1 .1"/><body pos="0 0 .15"><joint name="z" type="slide" axis="0 0 1"/>
+    <geom type="mesh" mesh="t"/></body></worldbody><actuator><motor joint="z" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def test_a_gpu_steps_by_warp_what_mjx_lacks(monkeypatch):
+    monkeypatch.setattr(load, "is_gpu", lambda: True)
+    with jax.enable_x64(False), pytest.warns(SceneWarning, match="MuJoCo Warp steps it: .*mesh"):
+        assert mg.load_scene(TETRAHEDRON).engine == "warp"
+    assert mg.load_scene(CART).engine == "mjx"
+    monkeypatch.setattr(load, "is_gpu", lambda: False)
+    with pytest.warns(SceneWarning, match="C MuJoCo steps it: .*mesh"):
+        assert mg.load_scene(TETRAHEDRON).engine == "mujoco"
+
+
+def test_check_tells_on_a_gpu_what_each_engine_takes(monkeypatch):
+    monkeypatch.setattr(load, "is_gpu", lambda: True)
+    monkeypatch.setattr(device, "is_cpu", lambda: False)
+    verdict = mg.check(TETRAHEDRON, budget=2.0)
+    (told,) = [one.text for one in verdict.findings if one.kind == "engine_prices"]
+    assert re.search(
+        r"^256 discrete gradients of 20 steps side by side take .* s by C MuJoCo .* s by MuJoCo Warp", told
+    )
+    # C MuJoCo is faster on a processor, and MJX refuses the scene.
+    assert verdict.recommendation.engine == "mujoco"
+    assert "engine='mujoco'" in verdict.code
