@@ -15,6 +15,7 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
+from experiments.problems.humanoid import pushed_humanoid
 from experiments.problems.pusher import pusher
 from experiments.problems.quadruped import quadruped
 from experiments.problems.trot import apg, trot
@@ -26,6 +27,7 @@ from experiments.words import capitalised, counted, joined, named, quantity
 from experiments.workspace import Workspace
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
+from mjxgrad.stepping import EngineName
 
 Method = Literal["onset", "discrete", "slope", "bundled", "alpha", "zeroth", "ppo"]
 NAMES = {
@@ -38,8 +40,12 @@ NAMES = {
     "ppo": "PPO",
 }
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, ZEROTH, "#777777"), strict=True))
-Name = Literal["cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot"]
-_OURS: dict[str, Callable[..., Environment]] = {"pusher": pusher, "quadruped": quadruped, "trot": trot}
+Name = Literal[
+    "cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot", "pushed_humanoid"
+]
+_OURS: dict[str, Callable[..., Environment]] = {
+    "pusher": pusher, "quadruped": quadruped, "trot": trot, "pushed_humanoid": pushed_humanoid,
+}  # fmt: skip
 _LOADERS = {name: _OURS.get(name) or getattr(envs.diffrl, name) for name in get_args(Name)}
 _OWN_STEPS = ("cartpole", *_OURS)  # whose time steps are their own
 _SHOWN = 8.0  # s of an episode
@@ -61,8 +67,9 @@ class Sizes(SettingsTable):
 class Settings(SizedSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
-    # What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, or the trot of MuJoCo's notebook.
+    # What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, MuJoCo's trot, or a humanoid that is pushed.
     environment: Name
+    engine: EngineName = "mjx"  # who steps while learning
     # SHAC, or analytic policy gradients as in brax: no value function, other networks and rates.
     algorithm: Literal["shac", "apg"] = "shac"
     methods: Annotated[tuple[Method, ...], Field(min_length=1)]  # which gradients learn; PPO is brax's
@@ -179,7 +186,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     if "ppo" in settings.methods:
         ppo.load()  # or say at once that it is not there
     substeps = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
-    environment = _LOADERS[settings.environment](**substeps)
+    environment = _LOADERS[settings.environment](**substeps).with_engine(settings.engine)
     workspace.check(environment.scene)
     courses, each = [], settings.sizes.num_updates
     with workspace.stage("learning", "updates", len(settings.methods) * each) as advance_to:

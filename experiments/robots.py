@@ -11,11 +11,14 @@ held as it is. Velocities are small, and controls within their ranges.
   over 33 to 2049 starts, as vectors. "consistent": within two standard errors, which are wide; "ill-defined": apart, but over so
   few steps' phases that there is no slope to speak of; "flagged": off where `Trajectory.explodes` says so. Files whose pose is
   beyond limits or inside other bodies begin where they come to rest.
+- `warp_single`: one step by MuJoCo Warp, where NVIDIA Warp is installed, as `c_*`; what it refuses is not counted.
 
 Each result is a line of JSON in runs/robots/, and a second call goes on from there.
 """
 
 import argparse
+import copy
+import importlib.util
 import json
 import math
 import multiprocessing
@@ -58,7 +61,9 @@ _FEWEST_TEETH = 4  # steps' phases that starts must cover
 _OFF = 2e-3  # m or rad, beyond limits, open welds or deep in contact, from which a file does not begin at its pose
 # Of A and B over the largest entry, and of motion. MJX's rounding in single precision grows by contact's condition, up to 1e5.
 _LIMITS = {"c_single": (1e-4, 1e-6), "c_double": (1e-4, 1e-6), "mjx_double": (1e-4, 1e-6), "mjx_single": (1e-2, 1e-3)}
+_LIMITS["warp_single"] = (5e-2, 1e-3)  # differences of whole steps, in single precision
 PARTS = (*list(_LIMITS)[:2], "slope_single", *list(_LIMITS)[2:])
+_INSTALLED = PARTS if importlib.util.find_spec("warp") else PARTS[:-1]
 _Start = tuple[np.ndarray, ...]  # qpos, qvel, act, ctrl
 
 
@@ -254,8 +259,10 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
             return {"nv": mujoco.MjModel.from_xml_path(path).nv}
         except ValueError as error:
             return {"nv": 0, "why": " ".join(str(error).split())[:200]}
-    begin, by_mjx = time.perf_counter(), part.startswith("mjx")
-    model = load(path, newton=by_mjx)
+    begin, engine = time.perf_counter(), {"m": "mjx", "w": "warp", "c": "mujoco"}[part[0]]
+    model = load(path, newton=part[0] in "mw")
+    if engine == "warp":
+        return _by_warp(model)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         scene = mg.load_scene(model)
@@ -266,7 +273,18 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
     if part == "c_single":
         _along(model, scene, np.zeros(1))
         found["seconds"] = round(time.perf_counter() - begin, 1)
-    return found | one_step(model, scene, "mjx" if by_mjx else "mujoco")
+    return found | one_step(model, scene, engine)
+
+
+def _by_warp(model: mujoco.MjModel) -> dict[str, Any]:
+    """Return what one step finds by MuJoCo Warp, whose solver gets as far as single precision goes, or why it refuses."""
+    ours = copy.deepcopy(model)
+    ours.opt.tolerance, ours.opt.iterations = 1e-8, 100
+    try:
+        scene = mg.load_scene(ours, engine="warp")
+    except mg.scene.SceneError as error:
+        return {"refused": str(error)}
+    return {"engine": "warp", "warned": False} | one_step(model, scene, "warp")
 
 
 def serve(part: str, connection: Any) -> None:
@@ -334,6 +352,8 @@ def failures(part: str, found: dict[str, Any]) -> list[str]:
     """Name what is wrong with what a part found of a file; nothing where all is right, or known not to be."""
     if "error" in found:
         return [found["error"]]
+    if "refused" in found:
+        return []
     if found.get("lost"):
         return [f"NaN without a flag at {found['lost']} starts"]
     if verdict := found.get("steps"):
@@ -362,7 +382,8 @@ def rows(paths: list[str], results: dict[str, dict[str, dict[str, Any]]]) -> lis
         file = path.removeprefix(f"{_CACHE}/")
         row = {"package": file.partition("/")[0], "file": file, "engine": first.get("engine"), "why": first.get("why")}
         untold = [part for part, one in parts.items() if is_untold(part, one)]
-        row |= {part: not wrong[part] if part in wrong and part not in untold else None for part in PARTS}
+        told = [part for part, one in parts.items() if part not in untold and "refused" not in one]
+        row |= {part: not wrong[part] if part in told else None for part in PARTS}
         del row["slope_single"]
         row["untold"] = "; ".join(untold)
         row |= {"50 steps": parts.get("slope_single", {}).get("steps"), "seconds": first.get("seconds")}
@@ -393,7 +414,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("--package", nargs="*", choices=list(PACKAGES), default=list(PACKAGES))
     parser.add_argument("--limit", type=int, help="files of each package")
-    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS, help="what to measure")
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=_INSTALLED, help="what to measure")
     parser.add_argument("--time-limit", type=float, default=120.0, help="s for a file in one part")
     options = parser.parse_args(arguments)
     _RUNS.mkdir(parents=True, exist_ok=True)

@@ -101,8 +101,20 @@ def g1() -> mujoco.MjModel:
     from experiments.robots import fetched
 
     spec = mujoco.MjSpec.from_file(str(fetched(_WHEEL) / _FILE))
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], rgba=[0.7, 0.7, 0.7, 1])
-    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1])
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], material="floor")
+    spec.body("pelvis").add_camera(
+        name="track",
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+        pos=[2.4, -1.6, 0.3],
+        xyaxes=[0.55, 0.83, 0, -0.15, 0.1, 1],
+    )
+    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.3, -1], diffuse=[0.25] * 3, castshadow=False)
+    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT}
+    spec.add_texture(name="sky", **sky, rgb1=[0.85, 0.9, 0.95], rgb2=[1, 1, 1], width=32, height=32)
+    checks = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
+    spec.add_texture(name="checks", **checks, rgb1=[0.75, 0.75, 0.75], rgb2=[0.82, 0.82, 0.82], width=64, height=64)
+    floor = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checks"
     spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     rest = [0.0, 0.0, _HEIGHT, 1.0, 0.0, 0.0, 0.0]
     for joint in spec.joints:
