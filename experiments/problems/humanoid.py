@@ -30,6 +30,7 @@ _HEIGHT, _LOWEST, _LEAST_UP = 0.755, 0.45, 0.6  # m of the pelvis; cosine of its
 _REACH = 0.5  # rad that an action of 1 moves a joint's target
 _PUSH = (0.2, 0.7)  # m/s that the robot is given at once
 _EVERY = 100  # actions from push to push
+_SUN = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
 
 
 class PushedHumanoid(Environment):
@@ -108,7 +109,7 @@ def g1() -> mujoco.MjModel:
         pos=[2.4, -1.6, 0.3],
         xyaxes=[0.55, 0.83, 0, -0.15, 0.1, 1],
     )
-    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.3, -1], diffuse=[0.25] * 3, castshadow=False)
+    spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.3, -1], diffuse=[0.3] * 3, castshadow=False, type=_SUN)
     sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT}
     spec.add_texture(name="sky", **sky, rgb1=[0.85, 0.9, 0.95], rgb2=[1, 1, 1], width=32, height=32)
     checks = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
