@@ -1,7 +1,7 @@
 """MuJoCo Warp, by MJX's bridge: nearly any scene, for thousands of states at once on NVIDIA GPUs, in single precision.
 
-It has no derivative of its own. A step's derivative is by central differences of whole steps: every column is two more worlds of
-the same call. Rounding wants other widths for positions, which curve, than for velocities and inputs, which hardly do. Reverse
+It has no derivative of its own. A step's derivative is by differences of whole steps: every column is one more world of the same
+call, or two by positions, where the step curves; by velocities and inputs it hardly does, and takes wider differences. Reverse
 mode keeps states alone and makes the columns again, as many at a time as memory takes. The slope is that of `stepping.pairs`; its
 contacts and limits are those of a second model, in which they act at larger gaps.
 """

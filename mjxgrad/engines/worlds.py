@@ -19,7 +19,7 @@ from mjxgrad.engines import events
 from mjxgrad.engines.bridge import NUMBER, Program, Room, Values
 from mjxgrad.stepping import pairs, slope
 
-_POSITION, _OTHER = 3e-5, 1e-3  # widths of differences (m or rad; m/s, rad/s or the unit of an input)
+_POSITION, _VELOCITY, _INPUT = 3e-5, 1e-3, 2e-3  # widths of differences (m or rad; m/s or rad/s; the unit of an input)
 _CLEAR = 0.8  # of the way to a surface, which differences of positions may go
 _LEAST = 2e-6  # of their widths; rounding is 3 % of such a difference
 _AT_ONCE = 2**32  # bytes of Warp's data for the worlds of one call
@@ -179,25 +179,35 @@ class Worlds:
         }  # fmt: skip
 
     def derivative(self, given: Values, names: tuple[str, ...]) -> Float[Array, "outputs columns"]:
-        """Return the derivative of the next state, in tangent space, and of readings by what is given, by central differences."""
-        dtype, points, widths = given["qpos"].dtype, [], []
+        """Return the derivative of the next state, in tangent space, and of readings by what is given, by differences.
+
+        Those by positions are central: by what else is given a step hardly curves, and one side takes half as many worlds.
+        """
+        dtype = given["qpos"].dtype
         given = {k: jax.lax.stop_gradient(x).astype(jnp.float32) for k, x in given.items()}  # so that widths are Warp's
+        worlds, ends = [{k: x[None] for k, x in given.items()}], []
         for name in names:
             size = self.mj_model.nv if name == "qpos" else given[name].size
-            away = self._reach(given) if name == "qpos" else jnp.array([[_OTHER], [-_OTHER]])
-            ends = [self._moved(given, name, one[:, None] * jnp.eye(size, dtype=jnp.float32)) for one in away]
-            widths.append(self._apart(name, ends[0], ends[1]))
-            points += [
-                {k: jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()} | {name: end} for end in ends
-            ]
-        found = self._run({k: jnp.concatenate([one[k] for one in points]) for k in given})
-        ends = np.cumsum([0] + [len(one["qpos"]) for one in points])
+            away = self._reach(given) if name == "qpos" else self._inward(given, name)[None]
+            own = [self._moved(given, name, one[:, None] * jnp.eye(size, dtype=jnp.float32)) for one in away]
+            worlds += [{k: jnp.broadcast_to(x, (size, *x.shape)) for k, x in given.items()} | {name: x} for x in own]
+            ends.append([*own, given[name][None]][:2])
+        found = self._run({k: jnp.concatenate([one[k] for one in worlds]) for k in given})
+        bounds = np.cumsum([len(one["qpos"]) for one in worlds])
+        middle, *parts = ({k: x[i:j] for k, x in found.items()} for i, j in zip([0, *bounds], bounds, strict=False))
         columns = []
-        for i, width in enumerate(widths):
-            after, before = ({k: x[ends[j] : ends[j + 1]] for k, x in found.items()} for j in (2 * i, 2 * i + 1))
-            apart = [jax.vmap(self._to_tangent)(before["qpos"], after["qpos"] - before["qpos"])]
-            apart += [after[k] - before[k] for k in ("qvel", "act", "sensordata")]
-            columns.append(jnp.concatenate(apart, axis=1) / width[:, None])
+        for name, (high, low) in zip(names, ends, strict=True):
+            after, before = parts.pop(0), parts.pop(0) if name == "qpos" else middle
+            before = {k: jnp.broadcast_to(x, after[k].shape) for k, x in before.items()}
+            width = self._apart(name, high, jnp.broadcast_to(low, high.shape))[:, None]
+            turned = jax.vmap(self._to_tangent)(before["qpos"], after["qpos"] - before["qpos"]) / width
+            changed, *others = ((after[k] - before[k]) / width for k in ("qvel", "act", "sensordata"))
+            if self.mj_model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+                # Known from the velocities; a small input moves positions by little more than their rounding.
+                own = jnp.eye(*changed.shape, dtype=jnp.float32) if name == "qpos" else jnp.zeros_like(changed)
+                end = given | {k: middle[k][0] for k in ("qpos", "qvel")}
+                turned = jax.vmap(functools.partial(self._carried, given, end))(own, changed)
+            columns.append(jnp.concatenate([turned, changed, *others], axis=1))
         return jnp.concatenate(columns).T.astype(dtype)
 
     def _reach(self, given: Values) -> Float[Array, "2 #nv"]:
@@ -216,6 +226,23 @@ class Worlds:
         return jnp.stack(
             [jnp.where(is_free | (ahead >= behind), ahead, 0), -jnp.where(is_free | (ahead < behind), behind, 0)]
         )
+
+    def _inward(self, given: Values, name: str) -> Float[Array, " size"]:
+        """Return the change of each input: where its range ends, into the range, as by C MuJoCo."""
+        if name not in ("ctrl", "act"):
+            return jnp.full(given[name].size, _VELOCITY if name == "qvel" else _INPUT)
+        limited, ends = (getattr(self.mj_model, f"actuator_{name}{kind}") for kind in ("limited", "range"))
+        middle = np.where(limited, ends.mean(axis=1), np.inf)
+        if name == "act":
+            middle = np.repeat(middle, np.maximum(self.mj_model.actuator_actnum, 0))
+        return jnp.where(given[name] > middle.astype(np.float32), -_INPUT, _INPUT)
+
+    def _carried(self, given: Values, end: Values, change: Float[Array, " nv"], speeding: Float[Array, " nv"]) -> Array:
+        """Return what becomes of positions by the velocities after the step, in tangent space."""
+        timestep = given.get(NUMBER + "opt.timestep", jnp.asarray(self.mj_model.opt.timestep, jnp.float32))
+        tangents = self._from_tangent(given["qpos"], change), speeding
+        move = lambda qpos, qvel: integrate_position(self.mj_model, qpos, qvel, timestep)  # noqa: E731
+        return self._to_tangent(end["qpos"], jax.jvp(move, (given["qpos"], end["qvel"]), tangents)[1])
 
     def _moved(self, given: Values, name: str, changes: Float[Array, "columns size"]) -> Array:
         if name != "qpos":

@@ -135,6 +135,17 @@ def test_differences_cross_no_surface():
         np.testing.assert_allclose(found, expected, atol=0.03 * np.abs(expected).max())  # rounding over 2e-6
 
 
+def test_a_control_at_the_end_of_its_range_has_the_derivative_within():
+    scene = mg.load_scene(CART.replace('gear="5"', 'gear="5" ctrllimited="true" ctrlrange="-1 1"'), engine="warp")
+    start = mg.initial_state(scene)
+    slope = jax.jit(jax.grad(lambda u, by: mg.rollout(by, start, u[None, None]).qvel[-1, 0]))
+    for control, share in ((1.0, 1.0), (-1.0, 1.0), (1.2, 0.0)):
+        u = jnp.asarray(control)
+        np.testing.assert_allclose(
+            slope(u, scene), share * slope(jnp.zeros(()), scene.with_engine("mujoco")), rtol=1e-3
+        )
+
+
 def test_the_slope_is_c_mujocos():
     ball = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .12"><freejoint/>
         <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
