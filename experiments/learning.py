@@ -185,8 +185,10 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     """Learn by every method at every stiffness."""
     if "ppo" in settings.methods:
         ppo.load()  # or say at once that it is not there
-    substeps = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
-    environment = _LOADERS[settings.environment](**substeps).with_engine(settings.engine)
+    given: dict[str, Any] = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
+    if settings.environment == "pushed_humanoid":  # whose file MJX would convert
+        given["engine"] = settings.engine
+    environment = _LOADERS[settings.environment](**given).with_engine(settings.engine)
     workspace.check(environment.scene)
     courses, each = [], settings.sizes.num_updates
     with workspace.stage("learning", "updates", len(settings.methods) * each) as advance_to:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -19,3 +20,19 @@ def run_python(*arguments, **environment):
     done = python(*arguments, **environment)
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
+
+
+def once(folder, name, write):
+    """Return the text that a function writes, which one of the processes that share a folder calls."""
+    path, part = folder / name, folder / f"{name}.part"
+    try:
+        part.touch(exist_ok=False)
+    except FileExistsError:
+        while not path.exists():
+            time.sleep(0.1)
+    else:
+        try:
+            part.write_text(write())
+        finally:
+            part.rename(path)
+    return path.read_text()

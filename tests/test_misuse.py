@@ -1,10 +1,11 @@
 """Wrong calls are answered in a sentence: in a process without the checks of types, which would answer first."""
 
 import json
+import os
 
 import pytest
 
-from tests.processes import run_python
+from tests.processes import once, run_python
 
 SETUP = """
 import functools, json, sys, tempfile, warnings
@@ -550,9 +551,12 @@ FOUND = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def answers():
-    printed, _ = run_python("-c", SETUP, json.dumps(list(FOUND)))
+@pytest.fixture(scope="session")
+def answers(tmp_path_factory):
+    # The workers of a run share the folder above their own.
+    base = tmp_path_factory.getbasetemp()
+    folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    printed = once(folder, "answers", lambda: run_python("-c", SETUP, json.dumps(list(FOUND)))[0])
     return json.loads(printed.splitlines()[-1])
 
 

@@ -15,6 +15,7 @@ from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import load_scene
+from mjxgrad.stepping import EngineName
 
 Memory = dict[str, Float[Array, "..."]]
 _WHEEL, _FILE = "mjlab==1.6.0", "mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml"
@@ -91,7 +92,7 @@ class PushedHumanoid(Environment):
         return (state.qpos[2] < _LOWEST) | (-_in_pelvis(state)[0][2] < _LEAST_UP)
 
 
-def pushed_humanoid(engine: str = "mjx") -> PushedHumanoid:
+def pushed_humanoid(engine: EngineName = "mjx") -> PushedHumanoid:
     """Return the task; a time step is 5 ms, an action holds for four, an episode lasts 8 s."""
     return PushedHumanoid(load_scene(g1(), engine=engine), frame_skip=4, episode_length=400)
 
