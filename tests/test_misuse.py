@@ -369,7 +369,7 @@ FOUND = {
     "mg.learning.Settings(critic_batches=5)": "critic_batches must divide the 1024 states of an update, got 5",
     "mg.learning.Settings(has_critic=False)": "trace must be 1 without a value function, got 0.9",
     # Arguments of another kind, or in another place.
-    "mg.linearise(scene, state, jnp.zeros(3))": "controls must have shape (1, 1), one row per step",
+    "mg.linearise(scene, state, jnp.zeros(3))": "ctrl must have shape (1,), one number per actuator",
     "mg.step(scene, state)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got Scene",
     "mg.check_stability(scene.model)": "scene must be of mg.load_scene, got Model",
     "mg.check(balls, lambda trajectory: trajectory.qpos)": "a scalar of shape () or one number per state, shape (",
@@ -506,6 +506,20 @@ FOUND = {
     "mg.render.frames(scene, state)": "qpos must be positions, got a state: give its .qpos",
     "mg.render.write_video(np.zeros((2, 4, 4, 3), np.uint8), 'v.mp4')": "path must be the path of a file, got ndarray",
     "mg.render.write_video('v.mp4', np.zeros((2, 4, 4, 5), np.uint8))": "video must have shape (frames, height, width, 3), got",
+    "mg.rollout(scene, eqx.tree_at(lambda s: s.time, state, jnp.zeros(3)), u)": "state.time must have shape () in this",
+    "mg.rollout(scene, eqx.tree_at(lambda s: s.qpos, state, None), u)": "state.qpos must be real numbers, got NoneType",
+    "mg.rollout(scene, eqx.tree_at(lambda s: s.qpos, state, jnp.zeros(1, int)), np.zeros((2, 1)))": "no error",
+    "mg.initial_state(scene, qpos=key)": "qpos must be real numbers, got a random key",
+    "mg.initial_state(scene, qpos=np.array([None]))": "qpos must be real numbers, got an array of objects or text",
+    "mg.initial_state(scene, qpos=np.ma.array([0.5], mask=[True]))": "qpos must be real numbers, got a masked array; fill it",
+    "roll(lambda p, s: jnp.array([1j]), horizon=2)": "the policy's controls must be real numbers, got complex64",
+    "mg.linearise(scene, state, jnp.zeros((1, 1)))": "ctrl must have shape (1,), one number per actuator, got (1, 1)",
+    "mg.rollout(mg.load_scene(scene.mj_model, engine='mujoco'), state, np.zeros((2, 1)), contact=mg.Onset())":
+        "contact=mg.Onset(...) is MJX's alone: ",
+    "scene.with_model(body_quat=jnp.zeros_like(scene.model.body_quat))": "body_quat must have directions, got zeros",
+    "scene.with_model(jnt_range=jnp.array([[1.0, -1.0]]))": "jnt_range must have its lower ends first, got [1.0, -1.0]",
+    "mg.over_devices(lambda a, b: a)(jnp.ones(3), jnp.ones(2))": "of one size, got leading axes of [(2,), (3,)]",
+    "optimise(objective=lambda c: noisy, annealing=lambda i: jnp.nan)": "scale of annealing must be finite, got nan at first",
     # Functions that leave JAX, numbers that are not real, and what would change nothing.
     "first(cost=lambda x: float(x[0]))": "function must compute with jax.numpy, got NumPy, float()",
     "optimise(objective=mg.parameter_noise(lambda x: np.sum(np.asarray(x)), 0.1))": "function must compute with jax.numpy",
@@ -548,6 +562,25 @@ FOUND = {
     "mg.Softness(stiffness=10**10)": "no error",
     "jax.jit(lambda: mg.learning.Settings().trace)()": "no error",
     "fit.Recording({'qpos': [0, 1, 2]}, [[0], [1]])": "no error",
+    # What environments' methods and policies give.
+    "Rewarded(scene, terms={'reward': 1.0}).reset(key)": "by text other than 'reward' and 'diverged', got ['reward']",
+    "type('Env', (Rewarded,), {'rewards': lambda *_: {1: 1.0}})(scene).reset(key)": "'reward' and 'diverged', got [1]",
+    "type('Env', (Rewarded,), {'rewards': lambda *_: {}})(scene).reset(key)": "rewards of Env must name at least one number",
+    "(env := type('Env', (Rewarded,), {'is_over': lambda *_: 0})(limited)).step(env.reset(key), [0.0])":
+        "is_over of Env must return True or False, got int32[]",
+    "(env := type('Env', (Rewarded,), {'is_over': lambda *_: None})(limited)).step(env.reset(key), [0.0])":
+        "is_over of Env must return True or False, got NoneType",
+    "(env := type('Env', (Rewarded,), {'control': lambda *_: None})(limited)).step(env.reset(key), [0.0])":
+        "control of Env must be real numbers, got NoneType",
+    "(env := type('Env', (Rewarded,), {'control': lambda *_: jnp.zeros(3)})(limited)).step(env.reset(key), [0.0])":
+        "control of Env must return a vector of shape (1,), got shape (3,)",
+    "(env := type('Env', (Rewarded,), {'next_memory': lambda *_: jnp.zeros(3)})(limited)).step(env.reset(key), [0.0])":
+        "next_memory of Env must return what has the form of its memory, None, got float32[3]",
+    "Rewarded(scene, randomisation=lambda key, scene: None).randomised(key)":
+        "what randomisation returns must be a scene, by scene.with_model, got NoneType",
+    "mg.learning.evaluate(Rewarded(limited), lambda obs: np.sin(np.asarray(obs)), key, num_episodes=2)":
+        "the policy must compute with jax.numpy",
+    "(env := Rewarded(limited, seen=[1, 2])).step(env.reset(key), [0.0])": "no error",
 }  # fmt: skip
 
 

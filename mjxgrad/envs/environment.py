@@ -8,6 +8,7 @@
 import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, Discrete
 
+_DIVERGED = "diverged"  # in the metrics, beside the terms of the reward
 Rewards = dict[str, Float[Array, ""]]
 Randomisation = Callable[[PRNGKeyArray, Scene], Scene]
 """A function from a key and a scene to a scene with other friction, masses or gains, by `scene.with_model`."""
@@ -169,21 +171,31 @@ class Environment(InScene):
         name = type(self).__name__
         instance(f"start of {name}", physics, State, "of mg.initial_state")
         physics = self.completed(physics)
-        obs = real(f"observe of {name}", self.observe(physics, memory))
-        if obs.ndim != 1:
-            raise ValueError(f"observe of {name} must return a vector, got shape {obs.shape}")
+        obs = self._vector("observe", self.observe(physics, memory))
         action = jnp.zeros(self.num_actions, obs.dtype)
-
-        def rewards() -> Rewards:
-            terms = self.rewards(physics, action, physics, memory)
-            instance(f"rewards of {name}", terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
-            return {term: as_scalar(value, f"{term!r} in rewards of {name}") for term, value in terms.items()}
-
-        terms = jax.eval_shape(rewards)
+        terms = jax.eval_shape(lambda: self._terms(physics, action, physics, memory, obs.dtype))
         zero, no = jnp.zeros((), obs.dtype), jnp.array(False)
-        metrics = dict.fromkeys([*terms, "diverged"], zero)
-        counter, hidden = jnp.zeros((), jnp.int32), self.privileged(physics, memory)
+        metrics = dict.fromkeys([*terms, _DIVERGED], zero)
+        counter, hidden = jnp.zeros((), jnp.int32), self._vector("privileged", self.privileged(physics, memory))
         return EnvState(physics, obs, hidden, zero, no, no, metrics, counter, memory, next_key)
+
+    def _vector(self, name: str, value: Any, size: int | None = None) -> Float[Array, " size"]:
+        """Return what a method of the subclass gave as floats."""
+        name = f"{name} of {type(self).__name__}"
+        vector = real(name, value)
+        if vector.ndim != 1 or (size is not None and len(vector) != size):
+            wanted = "a vector" if size is None else f"a vector of shape ({size},)"
+            raise ValueError(f"{name} must return {wanted}, got shape {vector.shape}")
+        return vector.astype(jnp.result_type(vector, float))
+
+    def _terms(self, before: State, action: Array, after: State, memory: PyTree, dtype: Any) -> Rewards:
+        """Return the terms of the reward as floats."""
+        terms, name = self.rewards(before, action, after, memory), f"rewards of {type(self).__name__}"
+        instance(name, terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
+        if not terms or not all(isinstance(term, str) for term in terms) or {"reward", _DIVERGED} & terms.keys():
+            wanted = "must name at least one number, by text other than 'reward' and 'diverged'"
+            raise ValueError(f"{name} {wanted}, got {list(terms)}")
+        return {term: as_scalar(value, f"{term!r} in {name}").astype(dtype) for term, value in terms.items()}
 
     def completed(self, physics: State) -> State:
         """Return a state with all that this environment's contact carries, such as the pairs of motions of a slope."""
@@ -194,26 +206,37 @@ class Environment(InScene):
         """Apply an action for `frame_skip` time steps; an episode that ended is not reset, see `step_on`.
 
         Raises:
-            ValueError: if the action does not have one number per actuator.
+            ValueError: if the action does not have one number per actuator, or a method returns something of another form than
+                at the reset.
         """
         action = real("action", action)
         instance("state", state, EnvState, "of reset or step")
         if action.shape != (self.num_actions,):
             remedy = "map over batches with jax.vmap"
             raise ValueError(f"action must have shape ({self.num_actions},), got {action.shape}: {remedy}")
-        action = jnp.clip(action, -1, 1)
+        action, name, dtype = jnp.clip(action, -1, 1), type(self).__name__, state.obs.dtype
         key, memory_key = jax.random.split(state.key)
-        controls = jnp.broadcast_to(self.control(action), (self.frame_skip, self.num_actions))
+        control = self._vector("control", self.control(action), self.num_actions)
+        controls = jnp.broadcast_to(control, (self.frame_skip, self.num_actions))
         course = rollout(self.scene, self.disturbed(state.physics, state.memory), controls, contact=self.contact)
         after = course.final
-        terms = self.rewards(state.physics, action, after, state.memory)
+        terms = self._terms(state.physics, action, after, state.memory, dtype)
         memory = self.next_memory(state.memory, action, after, memory_key)
+        forms = [jax.tree.map(lambda x: jax.typeof(x).str_short(), one) for one in (state.memory, memory)]
+        if jax.tree.flatten(forms[0]) != jax.tree.flatten(forms[1]):
+            raise ValueError(
+                f"next_memory of {name} must return what has the form of its memory, {forms[0]}, got {forms[1]}"
+            )
         num_steps = state.num_steps + 1
-        obs = self.observe(after, memory)
-        hidden, reward = self.privileged(after, memory), jnp.asarray(sum(terms.values()), obs.dtype)
-        terminated = self.is_over(after) | course.diverged
+        obs = self._vector("observe", self.observe(after, memory), state.obs.size)
+        hidden = self._vector("privileged", self.privileged(after, memory), state.privileged.size)
+        is_over = self.is_over(after)
+        if not eqx.is_array_like(is_over) or jnp.shape(is_over) or jnp.result_type(is_over) != bool:
+            given = jax.typeof(is_over).str_short() if eqx.is_array_like(is_over) else type(is_over).__name__
+            raise ValueError(f"is_over of {name} must return True or False, got {given}")
+        terminated = is_over | course.diverged
         truncated = (num_steps >= self.episode_length) & ~terminated
-        metrics = {**terms, "diverged": course.diverged.astype(obs.dtype)}
+        reward, metrics = jnp.asarray(sum(terms.values()), dtype), {**terms, _DIVERGED: course.diverged.astype(dtype)}
         return EnvState(after, obs, hidden, reward, terminated, truncated, metrics, num_steps, memory, key)
 
     def step_on(self, state: EnvState, action: Float[Array, " nu"]) -> tuple[EnvState, EnvState]:
@@ -237,7 +260,9 @@ class Environment(InScene):
         """Return a copy whose friction, masses and gains `randomisation` has drawn; under `jax.vmap`, many."""
         if self.randomisation is None:
             return self
-        return dataclasses.replace(self, scene=self.randomisation(key, self.scene))
+        scene = self.randomisation(key, self.scene)
+        instance("what randomisation returns", scene, Scene, "a scene, by scene.with_model")
+        return dataclasses.replace(self, scene=scene)
 
     def refined(self, times: int) -> "Environment":
         """Return the environment with time steps shorter by a factor of `times`; an action lasts as long as before.

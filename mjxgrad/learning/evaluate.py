@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import function, instance, one_key, one_of, whole
+from mjxgrad._arrays import function, instance, one_key, one_of, traceable, whole
 from mjxgrad._programs import compile_once
 from mjxgrad.engines import ENGINES, QUICK
 from mjxgrad.envs import Environment, EnvState
@@ -65,7 +65,9 @@ def evaluate(
 
         def advance(carry: tuple[EnvState, dict[str, Array], Array], _):
             state, totals, length = carry
-            stepped = judge.step(state, policy(state.obs))
+            with traceable("the policy"):
+                action = policy(state.obs)
+            stepped = judge.step(state, action)
             following = jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, stepped)
             now = stepped.metrics | {"reward": stepped.reward}
             totals = {name: total + jnp.where(state.done, 0.0, now[name]) for name, total in totals.items()}
