@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+_OBJECTS = {"ndarray": "an array of objects or text"}
+
 
 def as_float(value: Any, name: str = "softness") -> Any:
     """Return numbers as an array of floats, also integers (10000 is a natural stiffness); None stays None."""
@@ -27,7 +29,11 @@ def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
     except (TypeError, ValueError):
         kind = np.dtype(object)
     if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
-        raise ValueError(f"{name} must be real numbers, got {type(value).__name__ if kind.kind in 'OU' else kind}")
+        is_key = jnp.issubdtype(kind, jax.dtypes.prng_key)
+        got = type(value).__name__ if not is_key and kind.kind in "OU" else kind
+        raise ValueError(f"{name} must be real numbers, got {'a random key' if is_key else _OBJECTS.get(got, got)}")
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError(f"{name} must be real numbers, got a masked array; fill it")
     with contextlib.nullcontext() if is_traced else jax.ensure_compile_time_eval():
         return jnp.asarray(value, dtype)
 
@@ -137,7 +143,8 @@ def form(value: Any) -> str:
 
 def one_key(key: Any) -> None:
     """Refuse anything but a single random key."""
-    dtype, shape = getattr(key, "dtype", None), jnp.shape(key)
+    dtype = getattr(key, "dtype", None)
+    shape = () if key is None else jnp.shape(key)
     is_new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     if not ((is_new and shape == ()) or (dtype == jnp.uint32 and shape == (2,))):
         given = f"an array of shape {shape}" if shape else repr(key)

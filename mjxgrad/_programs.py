@@ -51,8 +51,9 @@ def parted(tree: Any, *, trusts_hash: bool = False) -> tuple[list[jax.Array], Fo
     def own(leaves: Sequence[Any]) -> Any:
         return eqx.combine(jax.tree.unflatten(structure, leaves), static)
 
+    places = tuple(eqx.is_array(x) for x in jax.tree.leaves(tree, is_leaf=lambda x: x is None))  # None is there, too
     try:
-        key = _content(static, seen)
+        key = places, _content(static, seen)
     except _UnknownError:
         key = (structure, *jax.tree.leaves(static)) if trusts_hash else own
     try:

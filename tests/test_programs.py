@@ -61,6 +61,9 @@ def test_functions_of_equal_content_share_a_program():
     assert not is_same(scaled(1.0), scaled(1))
     assert is_same(scaled(jnp.ones(3)), scaled(jnp.ones(3)))
     assert not is_same(scaled(jnp.ones(3)), scaled(jnp.zeros(3)))
+    # None where an array was is another form.
+    assert not is_same({"a": jnp.ones(2), "b": None}, {"a": None, "b": jnp.ones(2)})
+    assert not is_same([jnp.ones(2)], [None])
     assert is_same(optax.adam(1e-2), optax.adam(1e-2))
     assert not is_same(optax.adam(1e-2), optax.adam(1e-3))
     for function, change in ((wide, {"WIDTH": 2.0}), (listed, {"LIST": [2.0]})):

@@ -101,7 +101,10 @@ def over_devices(function: Callable[..., Any], *, num_shared: int = 0) -> Callab
         own = all_devices()
         sizes = {np.shape(x)[:1] for x in jax.tree.leaves(args[num_shared:])}
         if len(sizes) != 1 or sizes == {()}:
-            raise ValueError("all arguments that are not shared must have the batch as leading axis, of one size")
+            given = f"leading axes of {sorted(sizes)}" if sizes else "none that is not shared"
+            raise ValueError(
+                f"arguments that are not shared must have the batch as leading axis, of one size, got {given}"
+            )
         if len(own) == 1:
             return batched(*args)
         ((size,),) = sizes

@@ -26,7 +26,10 @@ def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
     if isinstance(contact, engine.contacts) and is_able:
         return engine
     if scene.unsupported:
-        raise SceneError(scene.unsupported)
+        alone = (
+            "" if isinstance(contact, engine.contacts) else f"contact=mg.{type(contact).__name__}(...) is MJX's alone: "
+        )
+        raise SceneError(alone + scene.unsupported)
     return ENGINES["mjx"]
 
 

@@ -8,9 +8,10 @@ from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from mjxgrad._arrays import form
+from mjxgrad._arrays import form, real
 from mjxgrad._mjx import mjx
 from mjxgrad.engines.state import State, Trajectory
 from mjxgrad.scene import Scene
@@ -84,4 +85,5 @@ def one_each(chosen: Any, count: int) -> Float[Array, " nu"]:
     chosen = jnp.asarray(chosen) if isinstance(chosen, list) else chosen
     if not eqx.is_array_like(chosen) or jnp.shape(chosen) != (count,):
         raise ValueError(f"the policy must return one control per actuator, shape ({count},), got {form(chosen)}")
-    return jnp.asarray(chosen)
+    is_switch = getattr(chosen, "dtype", None) == np.bool_
+    return real("the policy's controls", chosen * 1 if is_switch else chosen)

@@ -201,21 +201,46 @@ def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *argument
 
 
 def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
+    arguments = jax.tree.map(jnp.asarray, arguments)
+    types = [x.dtype for x in jax.tree.leaves(arguments)]
+
     def run(*given) -> dict[str, np.ndarray]:
         give_up_if_stopped()
-        given = jax.tree.map(np.asarray, given)
+        leaves, structure = jax.tree.flatten(given)
+        leaves = [_whole(np.asarray(x), dtype) for x, dtype in zip(leaves, types, strict=True)]
         try:
-            found = function(*given)
+            found = function(*jax.tree.unflatten(structure, leaves))
         except mujoco.FatalError as error:  # of memory, as a rule; XLA would show it in a page of its own
             reason = " ".join(str(error).split())
             warnings.warn(f"C MuJoCo gave up, and its numbers are NaN: {reason}", SceneWarning, stacklevel=2)
             inner = [np.ndim(x) for x in jax.tree.leaves(arguments)]
-            parts = [x.shape[: x.ndim - n] for x, n in zip(jax.tree.leaves(given), inner, strict=True)]
+            parts = [x.shape[: x.ndim - n] for x, n in zip(leaves, inner, strict=True)]
             batch = np.broadcast_shapes(*parts)
             found = {name: np.full((*batch, *shape.shape), np.nan) for name, shape in shapes.items()}
-        return {k: np.asarray(x, shapes[k].dtype) for k, x in found.items()}
+        return {k: _halves(np.asarray(x, shapes[k].dtype)) for k, x in found.items()}
 
-    return jax.pure_callback(run, shapes, *arguments, vmap_method="expand_dims")
+    wanted = {k: jax.ShapeDtypeStruct(*_form_of_halves(x)) for k, x in shapes.items()}
+    given = jax.tree.map(
+        lambda x: jax.lax.bitcast_convert_type(x, np.uint32) if x.dtype.itemsize == 8 else x, arguments
+    )
+    found = jax.pure_callback(run, wanted, *given, vmap_method="expand_dims")
+    return {
+        k: jax.lax.bitcast_convert_type(x, shapes[k].dtype) if x.dtype == np.uint32 else x for k, x in found.items()
+    }
+
+
+# Double precision crosses a callback in halves: `jax.enable_x64` as a context holds for one thread, and in XLA's others JAX would
+# make single precision of it.
+def _whole(value: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    return np.ascontiguousarray(value).view(dtype)[..., 0] if value.dtype != dtype else value
+
+
+def _halves(value: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(value)[..., None].view(np.uint32) if value.dtype.itemsize == 8 else value
+
+
+def _form_of_halves(shape: jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], Any]:
+    return ((*shape.shape, 2), np.uint32) if shape.dtype.itemsize == 8 else (shape.shape, shape.dtype)
 
 
 def to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:

@@ -115,8 +115,12 @@ def direction(state: State) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
 
 
 def check_scene(scene: Any) -> None:
-    """Refuse what is no scene."""
+    """Refuse what is no scene, or one of a precision that is off."""
     instance("scene", scene, Scene, "of mg.load_scene")
+    if scene.data.qpos.dtype == jnp.float64 != jnp.result_type(float):
+        raise ValueError(
+            f"{scene.name} was loaded in double precision, which is off now: load it again, or set jax_enable_x64"
+        )
 
 
 class DivergedError(FloatingPointError):

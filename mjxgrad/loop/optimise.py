@@ -7,11 +7,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, instance, one_key, takes
+from mjxgrad._arrays import function, instance, known, one_key, real, takes
 from mjxgrad.estimators.estimate import Estimator, GradientEstimate
 from mjxgrad.loop.descent import Carry, Descent, RunOptions
 from mjxgrad.loop.result import Optimisation, Record
@@ -99,6 +100,8 @@ class GradientStep(Descent):
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
+        elif (scale := known(real("the scale of annealing", self.annealing(0)))) is not None and not np.isfinite(scale):
+            raise ValueError(f"the scale of annealing must be finite, got {scale} at first")
         function("estimator", self.estimator, "objective", "params", "key", is_needed=True)
         instance(
             "optimiser", self.optimiser, optax.GradientTransformation, "of optax with its settings, as optax.adam(1e-2)"

@@ -15,7 +15,7 @@ from mjxgrad._arrays import form, function, one_of, traceable, whole
 from mjxgrad.contact import Softness
 from mjxgrad.engines.state import check_scene
 from mjxgrad.rollouts import Observe, PolicyFunction, Sees, State, Trajectory, rollout
-from mjxgrad.rollouts.rollout import check_start
+from mjxgrad.rollouts.rollout import started
 from mjxgrad.scene import Scene
 from mjxgrad.stepping import Contact, EngineName, Slope, check_contact
 
@@ -125,7 +125,7 @@ class SceneTask(Task, InScene):
     policy_sees: Sees = eqx.field(static=True, default="state", kw_only=True)
 
     def __check_init__(self):
-        check_start(self.scene, self.state)
+        started(self.scene, self.state)  # refuses what is none
         one_of("policy_sees", self.policy_sees, get_args(Sees))
         function("cost", self.cost, "trajectory", is_needed=True)
         function("start_distribution", self.start_distribution, "key")
@@ -140,7 +140,10 @@ class SceneTask(Task, InScene):
 
     def sample_start(self, key: PRNGKeyArray) -> State | None:
         """Return a draw from `start_distribution`, or None without one."""
-        return None if self.start_distribution is None else self.start_distribution(key)
+        if self.start_distribution is None:
+            return None
+        instance("what start_distribution returns", drawn := self.start_distribution(key), State, "of mg.initial_state")
+        return drawn
 
     def run(
         self,

@@ -73,7 +73,7 @@ def rollout(
         ValueError: if contact is none of the four records, shapes do not fit the scene, the horizon is missing or contradicted,
             or known controls or noise are not finite (inside `jax.jit` the rollout is flagged as diverged at this step).
     """
-    check_start(scene, state)
+    state = started(scene, state)
     engine = engine_of(scene, contact)
     for message in smoothing_warnings(scene.model) if isinstance(contact, Smoothing) else ():
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
@@ -152,8 +152,10 @@ def linearise(
     Raises:
         ValueError: as `rollout`.
     """
-    check_start(scene, state)
-    ctrl = scene.data.ctrl if ctrl is None else jnp.asarray(ctrl, scene.data.ctrl.dtype)
+    state = started(scene, state)
+    ctrl = scene.data.ctrl if ctrl is None else real("ctrl", ctrl, scene.data.ctrl.dtype)
+    if ctrl.shape != (scene.model.nu,):
+        raise ValueError(f"ctrl must have shape ({scene.model.nu},), one number per actuator, got {ctrl.shape}")
     sequence_of(ctrl[None], None, 1, scene.model.nu)
     return Linearisation(*engine_of(scene, contact).linearise(scene, state, ctrl, contact))
 
@@ -204,14 +206,18 @@ def sequence_of(
     return given.get("controls"), horizon
 
 
-def check_start(scene: Any, state: Any) -> None:
-    """Refuse what is no scene or no state, a state of another scene, or several states at once."""
+def started(scene: Any, state: Any) -> State:
+    """Return a state in the scene's precision; refuse what is no scene or no state, a state of another, or several at once."""
     check_scene(scene)
     instance("state", state, State, "of mg.initial_state, or the end of a rollout")
-    for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na)):
-        if (shape := jnp.shape(getattr(state, name))) != (size,):
+    parts, dtype = {}, scene.data.qpos.dtype
+    for name, size in (("qpos", scene.model.nq), ("qvel", scene.model.nv), ("act", scene.model.na), ("time", None)):
+        parts[name] = part = real(f"state.{name}", getattr(state, name), dtype)
+        if part.shape != (wanted := () if size is None else (size,)):
             remedy = "map over batches with jax.vmap"
-            raise ValueError(f"state.{name} must have shape ({size},) in this scene, got {shape}: {remedy}")
+            raise ValueError(f"state.{name} must have shape {wanted} in this scene, got {part.shape}: {remedy}")
+    state = dataclasses.replace(state, **parts)
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) and x.dtype != dtype else x, state)
 
 
 def applied(scene: Scene, inputs: Mapping[str, ArrayLike] | None, horizon: int) -> dict[str, Array]:

@@ -156,6 +156,10 @@ class Scene(eqx.Module):
             if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
                 requirement = "be positive" if name == "timestep" else "not be negative"
                 raise ValueError(f"{name} must {requirement}, got {least:g}")
+            if name.endswith("range") and (crossed := numbers[..., 0] > numbers[..., 1]).any():
+                raise ValueError(f"{name} must have its lower ends first, got {numbers[crossed][0].tolist()}")
+            if name.endswith(("_quat", "_axis")) and not np.linalg.norm(numbers, axis=-1).all():
+                raise ValueError(f"{name} must have directions, got zeros")
         if "body_mass" in known and (empty := _without_mass(self.mj_model, known["body_mass"])):
             raise ValueError(f"body_mass must leave every moving body some mass, got none for {empty}")
         if "wind" in fields and not has_medium(self.mj_model):
