@@ -24,6 +24,7 @@ _CLEAR = 0.8  # of the way to a surface, which differences of positions may go
 _LEAST = 2e-6  # of their widths; rounding is 3 % of such a difference
 _AT_ONCE = 2**32  # bytes of Warp's data for the worlds of one call
 _ROOM = 48  # contacts of a world, unless `max_contacts` says
+_MOST_DENSE = 60  # degrees of freedom, from which Warp has sparse rows alone
 _TILE = 64  # Warp reads rows in blocks of so many, beyond the end if they do not fit
 _NEAREST = 24  # contacts and limits of a world that its slope looks at
 _FAR = 1e3  # m or rad: the gap of none
@@ -90,9 +91,11 @@ class Worlds:
     @functools.cached_property
     def _far(self) -> Program:
         model = copy.deepcopy(self.mj_model)  # whose rows are wanted, in full, and not the solution
-        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        is_sparse = model.nv > _MOST_DENSE
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE if is_sparse else mujoco.mjtJacobian.mjJAC_DENSE
         model.opt.iterations = model.opt.ls_iterations = 1
-        rows = tuple(f"efc.{name}" for name in ("J", "type", "id", "pos", "margin"))
+        names = ("J", "type", "id", "pos", "margin", *(("J_rownnz", "J_rowadr", "J_colind") if is_sparse else ()))
+        rows = tuple(f"efc.{name}" for name in names)
         return Program(model, "forward", (*rows, "nefc", "contact.solimp", "qacc_smooth"), self._room)
 
     @functools.cached_property
@@ -124,7 +127,7 @@ class Worlds:
         return {"contact": contact, "limit": least + max(1.0, levers.max(initial=0.0)) * travel.sum()}
 
     def _nearest(self, solimps: Float[Array, "contacts 5"], found: Values, extra: Values, numbers: Values) -> Values:
-        rows, kind, index = found["efc.J"][:, : self.mj_model.nv], found["efc.type"], found["efc.id"]
+        kind, index = found["efc.type"], found["efc.id"]
         is_contact, is_joint = kind >= _CONTACT, kind == _JOINT
         is_first = jnp.concatenate([jnp.ones(1, bool), (index[1:] != index[:-1]) | ~is_contact[:-1]])
         is_one = (is_contact & is_first) | is_joint | (kind == _TENDON)
@@ -135,7 +138,7 @@ class Worlds:
         is_contact, is_joint, index = is_contact[nearest], is_joint[nearest], index[nearest]
         # The first two edges of a pyramid, n + μt and n - μt, have the normal as their mean.
         other = nearest + (kind[nearest] == _PYRAMID)
-        normals = 0.5 * (rows[nearest] + rows.at[other].get(mode="clip"))
+        normals = 0.5 * (self._rows(found, nearest) + self._rows(found, other))
         solimp = solimps.at[index].get(mode="clip")
         for name, is_own in (("jnt_solimp", is_joint), ("tendon_solimp_lim", ~is_contact & ~is_joint)):
             table = numbers.get(NUMBER + name, jnp.asarray(getattr(self.mj_model, name), jnp.float32))
@@ -146,6 +149,16 @@ class Worlds:
             "rows": jnp.where(is_one[:, None], normals, 0.0), "gaps": gaps[nearest], "solimp": solimp,
             "is_contact": is_contact, "is_blind": jnp.zeros_like(is_contact), "acceleration": found["qacc_smooth"],
         }  # fmt: skip
+
+    def _rows(self, found: Values, chosen: Array) -> Float[Array, "rows nv"]:
+        """Return some rows of the constraints' Jacobian, dense."""
+        jacobian, nv = found["efc.J"], self.mj_model.nv
+        if "efc.J_colind" not in found:
+            return jacobian[:, :nv].at[chosen].get(mode="clip")
+        first, count = (found[f"efc.J_{name}"].at[chosen].get(mode="clip")[:, None] for name in ("rowadr", "rownnz"))
+        values, columns = (x[0].at[first + jnp.arange(nv)].get(mode="clip") for x in (jacobian, found["efc.J_colind"]))
+        values = jnp.where(jnp.arange(nv) < count, values, 0.0)
+        return jnp.zeros((len(chosen), nv)).at[jnp.arange(len(chosen))[:, None], columns].add(values, mode="drop")
 
     def near(self, given: Values) -> pairs.Gaps:
         """Return the nearest contacts and limits of a world, as constants."""

@@ -146,7 +146,9 @@ def test_a_control_at_the_end_of_its_range_has_the_derivative_within():
         )
 
 
-def test_the_slope_is_c_mujocos():
+@pytest.mark.parametrize("most_dense", [60, 0], ids=["dense", "sparse"])
+def test_the_slope_is_c_mujocos(most_dense, monkeypatch):
+    monkeypatch.setattr(worlds, "_MOST_DENSE", most_dense)
     ball = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="2 2 .1"/><body pos="0 0 .12"><freejoint/>
         <geom size=".1" mass="1"/></body></worldbody></mujoco>"""
     speeds = np.array([1.0, 0, -0.5, 0, 0, 0]) + np.random.default_rng(0).normal(size=(8, 6)) * [[0.3] * 3 + [0.9] * 3]
