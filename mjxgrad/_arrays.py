@@ -11,8 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_OBJECTS = {"ndarray": "an array of objects or text"}
-
 
 def as_float(value: Any, name: str = "softness") -> Any:
     """Return numbers as an array of floats, also integers (10000 is a natural stiffness); None stays None."""
@@ -29,9 +27,10 @@ def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
     except (TypeError, ValueError):
         kind = np.dtype(object)
     if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
-        is_key = jnp.issubdtype(kind, jax.dtypes.prng_key)
-        got = type(value).__name__ if not is_key and kind.kind in "OU" else kind
-        raise ValueError(f"{name} must be real numbers, got {'a random key' if is_key else _OBJECTS.get(got, got)}")
+        got = "a random key" if jnp.issubdtype(kind, jax.dtypes.prng_key) else str(kind)
+        if got == "object" or got.startswith("<U"):
+            got = "an array of objects or text" if isinstance(value, np.ndarray) else type(value).__name__
+        raise ValueError(f"{name} must be real numbers, got {got}")
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError(f"{name} must be real numbers, got a masked array; fill it")
     with contextlib.nullcontext() if is_traced else jax.ensure_compile_time_eval():

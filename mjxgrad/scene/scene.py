@@ -266,7 +266,7 @@ def check_engine(engine: EngineName | None, mj_model: mujoco.MjModel) -> None:
         raise SceneError("engine='warp' needs NVIDIA Warp: pip install 'mjxgrad[warp]'")
     if mj_model.nhistory:  # a rollout does not carry them from step to step
         raise SceneError("engine='warp' carries no delays of actuators or sensors: take engine='mujoco'")
-    import warp
+    import warp  # pyright: ignore[reportMissingImports]
     from mujoco.mjx.third_party import mujoco_warp
 
     warp.config.log_level = max(warp.config.log_level, logging.WARNING)  # a library must not print
