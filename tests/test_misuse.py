@@ -581,6 +581,37 @@ FOUND = {
     "mg.learning.evaluate(Rewarded(limited), lambda obs: np.sin(np.asarray(obs)), key, num_episodes=2)":
         "the policy must compute with jax.numpy",
     "(env := Rewarded(limited, seen=[1, 2])).step(env.reset(key), [0.0])": "no error",
+    # What plans are made of.
+    "planning.optimise_trajectory(system, Leaving(), jnp.zeros(3), np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
+        "start must have shape (2,) in this system, got (3,)",
+    "planning.optimise_trajectory(system, Leaving(), state, np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
+        "start must be real numbers, got State",
+    "planning.optimise_trajectory(system, Leaving(), [0, jnp.nan], np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
+        "start must be finite, got [0.0, nan]",
+    "planning.optimise_trajectory(system, Leaving(), [0, 0], np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
+        "cost must compute with jax.numpy",
+    "planned(schedule='fast')": "schedule must be real numbers, got str",
+    "planned(lower=jnp.zeros(5))": "lower must be one number or have shape (2,), got (5,)",
+    "planned(upper='none')": "upper must be real numbers, got str",
+    "planning.FunctionSystem(lambda x: x, 2, 2)": "function must be a function of state and control, got Partial: too many",
+    "planning.FunctionSystem(max, '2', 2)": "num_changes must be a whole number, got '2'",
+    "planning.FunctionSystem(lambda x, u: jnp.zeros(3), 2, 2).step(jnp.zeros(2), jnp.zeros(2))":
+        "function must return the next state, of shape (2,), got (3,)",
+    "planning.FunctionSystem(lambda x, u: None, 2, 2).step(jnp.zeros(2), jnp.zeros(2))":
+        "the next state by function must be real numbers, got NoneType",
+    "type('Cost', (Leaving,), {'stage': lambda *_: None})().total(system, jnp.zeros((2, 2)), jnp.zeros((1, 2)))":
+        "stage of a cost must return one number, got NoneType",
+    "type('Cost', (Leaving,), {'stage': lambda *_: 0})().total(system, jnp.zeros((2, 2)), jnp.zeros((1, 2)))": "no error",
+    "planning.GoalCost('up', 1.0, 1.0, 0.1)": "goal must be real numbers, got str",
+    "planning.GoalCost(jnp.full(2, jnp.nan), 1.0, 1.0, 0.1)": "goal must be finite, got [nan nan]",
+    "planning.GoalCost(jnp.zeros(2), jnp.inf, 1.0, 0.1)": "stage_weight must be at least 0 and finite, got inf",
+    "planning.Analytic(0.1)": "smoothing must be such as mg.Smoothing(0.01), or None, got float",
+    "planning.Sampled(-0.1, 0.1, 8)": "stddev_state must be at least 0 and finite, got -0.1",
+    "decided(stddev=-1.0)": "stddev must be at least 0 and finite, got [-1. -1.]",
+    "setattr(planning.Controller(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), np.zeros((3, 2))), 'cost', None)":
+        "make a new Controller for a cost of another form",
+    "planning.Controller(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), np.zeros((3, 2)))('now')":
+        "state must be a vector, or for a scene its State or C MuJoCo's data, got str",
 }  # fmt: skip
 
 

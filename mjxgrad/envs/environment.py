@@ -231,7 +231,11 @@ class Environment(InScene):
         obs = self._vector("observe", self.observe(after, memory), state.obs.size)
         hidden = self._vector("privileged", self.privileged(after, memory), state.privileged.size)
         is_over = self.is_over(after)
-        if not eqx.is_array_like(is_over) or jnp.shape(is_over) or jnp.result_type(is_over) != bool:
+        if (
+            not eqx.is_array_like(is_over)
+            or jnp.shape(is_over)
+            or not jnp.issubdtype(jnp.result_type(is_over), jnp.bool)
+        ):
             given = jax.typeof(is_over).str_short() if eqx.is_array_like(is_over) else type(is_over).__name__
             raise ValueError(f"is_over of {name} must return True or False, got {given}")
         terminated = is_over | course.diverged

@@ -18,7 +18,7 @@ from mjxgrad._arrays import real, traceable, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Exact, Smoother
 from mjxgrad.planning.system import Cost, System
-from mjxgrad.planning.trajectory import Course, Problem, posed
+from mjxgrad.planning.trajectory import Course, Problem, per_control, posed
 from mjxgrad.rollouts import State
 
 PARTS: tuple[str, ...] = ("linear models", "backward pass", "rollouts")
@@ -86,16 +86,31 @@ class Controller(Printed):
         if deadline is not None and not real("deadline", deadline) > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
         self.num_samples = whole("num_samples", num_samples, 0)
-        both = [np.asarray(one) for one in (schedule if first_schedule is None else first_schedule, schedule)]
+        both = [schedule if first_schedule is None else first_schedule, schedule]
         given = system, cost, None, controls, jax.random.key(0), smoother, both, lower, upper
-        problem, start, factors = posed(*given)
+        problem, _, start, factors = posed(*given)
         self._schedules, self._origin = [np.asarray(one) for one in factors], np.asarray(system.origin)
-        self.stddev = np.broadcast_to(np.asarray(stddev, self._origin.dtype), (system.num_controls,))
-        self.system, self.cost, self.deadline = system, cost, deadline
+        self.stddev = np.asarray(per_control("stddev", stddev, system, self._origin.dtype))
+        if not ((self.stddev >= 0) & (self.stddev < np.inf)).all():
+            raise ValueError(f"stddev must be at least 0 and finite, got {self.stddev}")
+        self.system, self._cost, self.deadline = system, cost, deadline
         self._compile(problem, start)
         self._measure()
         if deadline is not None and (least := sum(self.price.values()) / len(self._schedules[1])) > deadline:
             warnings.warn(self._too_short(least), stacklevel=2)
+
+    @property
+    def cost(self) -> Cost:
+        return self._cost
+
+    @cost.setter
+    def cost(self, cost: Cost) -> None:
+        before, after = (_numbers_of(one) for one in (self._cost, cost))
+        if before != after:
+            raise ValueError(
+                "cost must have the form of the compiled one: make a new Controller for a cost of another form"
+            )
+        self._cost = cost
 
     def _compile(self, problem: Problem, controls: Array) -> None:
         """Compile the three parts, at once."""
@@ -220,7 +235,11 @@ class Controller(Printed):
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
         parts = [getattr(state, name) for name in ("qpos", "qvel", "act")] if hasattr(state, "qpos") else [state]
-        vector = np.concatenate(parts).astype(self._origin.dtype)
+        try:
+            vector = np.concatenate(parts).astype(self._origin.dtype)
+        except (TypeError, ValueError):
+            wanted = "a vector, or for a scene its State or C MuJoCo's data"
+            raise ValueError(f"state must be {wanted}, got {type(state).__name__}") from None
         if vector.shape != self._origin.shape:
             raise ValueError(f"state must have shape {self._origin.shape} in this system, got {vector.shape}")
         if not np.isfinite(vector).all():
@@ -260,3 +279,9 @@ class Controller(Printed):
 
 def _ms(seconds: float) -> str:
     return f"{format_number(1e3 * seconds)} ms"
+
+
+def _numbers_of(cost: Cost) -> tuple[Any, list[str]]:
+    """Return the structure and the shapes of a cost's numbers: what its programs are compiled for."""
+    leaves, tree = jax.tree.flatten(eqx.filter(cost, eqx.is_inexact_array_like))
+    return tree, [jax.typeof(leaf).str_short() for leaf in leaves]

@@ -23,6 +23,7 @@ References:
     Models. T-RO 2023, arXiv:2206.10787.
 """
 
+import functools
 from abc import abstractmethod
 from typing import Literal
 
@@ -32,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from mjxgrad._arrays import is_known, known, whole
+from mjxgrad._arrays import instance, is_known, known, real, whole
 from mjxgrad._text import name_pairs
 from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System, resting
 from mjxgrad.stepping import Smoothing
@@ -91,6 +92,9 @@ class Analytic(Smoother):
 
     smoothing: Smoothing | None
 
+    def __check_init__(self):
+        instance("smoothing", self.smoothing, Smoothing | None, "such as mg.Smoothing(0.01), or None")
+
     def step(self, system, state, control, key):
         return self._smoothed(system, "forward").step(state, control)
 
@@ -140,8 +144,10 @@ class Sampled(Smoother):
         order: "first" averages derivatives. "zeroth" fits a plane, to two samples more than noisy coordinates at least.
     """
 
-    stddev_state: Float[Array, "..."] | None = eqx.field(converter=lambda x: x if x is None else jnp.asarray(x))
-    stddev_control: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
+    stddev_state: Float[Array, "..."] | None = eqx.field(
+        converter=lambda x: x if x is None else real("stddev_state", x)
+    )
+    stddev_control: Float[Array, "..."] = eqx.field(converter=functools.partial(real, "stddev_control"))
     num_samples: int = eqx.field(static=True)
     order: Literal["first", "zeroth"] = eqx.field(static=True, default="zeroth")
 
@@ -149,6 +155,10 @@ class Sampled(Smoother):
         whole("num_samples", self.num_samples)
         if self.order not in ("first", "zeroth"):
             raise ValueError(f"order must be 'first' or 'zeroth', got {self.order!r}")
+        for name in ("stddev_state", "stddev_control"):
+            value = None if (given := getattr(self, name)) is None else known(given)
+            if value is not None and not ((value >= 0) & (value < np.inf)).all():
+                raise ValueError(f"{name} must be at least 0 and finite, got {value}")
 
     def step(self, system, state, control, key):
         """Return the mean of the finite next states; samples have mirror images, so a linear step has no error."""
@@ -213,8 +223,6 @@ class Sampled(Smoother):
             value = jnp.asarray(0.0 if (given := getattr(self, name)) is None else given, state.dtype)
             if value.shape not in ((), (size,)):
                 raise ValueError(f"{name} must be a number or have shape ({size},), got shape {value.shape}")
-            if (numbers := known(value)) is not None and not ((numbers >= 0) & np.isfinite(numbers)).all():
-                raise ValueError(f"{name} must be at least 0 and finite, got {numbers}")
             parts.append(jnp.broadcast_to(value, (size,)))
         stddev = jnp.concatenate(parts)
         return stddev, jax.random.normal(key, (self.num_samples, stddev.size), state.dtype)

@@ -4,6 +4,7 @@ A state is one flat vector. A change of it has the coordinates of the tangent sp
 """
 
 import dataclasses
+import functools
 from abc import abstractmethod
 from collections.abc import Callable
 
@@ -14,12 +15,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from mjxgrad._arrays import known, whole
+from mjxgrad._arrays import function, known, real, traceable, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, kinematics, position_change
 from mjxgrad.engines import Engine, engine_of
 from mjxgrad.engines.state import check_scene
+from mjxgrad.objective.base import as_scalar
 from mjxgrad.objective.task import as_pytree
 from mjxgrad.rollouts import State
 from mjxgrad.scene import Scene
@@ -109,8 +111,17 @@ class FunctionSystem(System):
     num_changes: int = eqx.field(static=True)
     num_controls: int = eqx.field(static=True)
 
+    def __check_init__(self):
+        function("function", self.function, "state", "control", is_needed=True)
+        whole("num_changes", self.num_changes)
+        whole("num_controls", self.num_controls, 0)
+
     def step(self, state: ChangeVector, control: ControlVector) -> ChangeVector:
-        return self.function(state, control)
+        with traceable("function"):
+            after = real("the next state by function", self.function(state, control))
+        if after.shape != state.shape:
+            raise ValueError(f"function must return the next state, of shape {state.shape}, got {after.shape}")
+        return after.astype(jnp.result_type(after, float))
 
 
 class SceneSystem(System):
@@ -253,8 +264,9 @@ class Cost(eqx.Module):
         self, system: System, states: Float[Array, "states state"], controls: Float[Array, "horizon m"]
     ) -> Float[Array, ""]:
         """Return the cost of a trajectory of `horizon + 1` states."""
-        stages = jax.vmap(lambda state, control: self.stage(system, state, control))(states[:-1], controls)
-        return stages.sum() + self.terminal(system, states[-1])
+        one = lambda state, control: as_scalar(self.stage(system, state, control), "stage of a cost")  # noqa: E731
+        stages, end = jax.vmap(one)(states[:-1], controls), self.terminal(system, states[-1])
+        return stages.sum() + as_scalar(end, "terminal of a cost")
 
 
 class LeastSquares(Cost):
@@ -285,16 +297,19 @@ class GoalCost(LeastSquares):
         control_weight: weight of each control.
     """
 
-    goal: StateVector = eqx.field(converter=jnp.asarray)
-    stage_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
-    terminal_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
-    control_weight: Float[Array, "..."] = eqx.field(converter=jnp.asarray)
+    goal: StateVector = eqx.field(converter=functools.partial(real, "goal"))
+    stage_weight: Float[Array, "..."] = eqx.field(converter=functools.partial(real, "stage_weight"))
+    terminal_weight: Float[Array, "..."] = eqx.field(converter=functools.partial(real, "terminal_weight"))
+    control_weight: Float[Array, "..."] = eqx.field(converter=functools.partial(real, "control_weight"))
 
     def __check_init__(self):
+        # By NumPy: operations of JAX are traced inside jit even on known values.
+        if (goal := known(self.goal)) is not None and not np.isfinite(goal).all():
+            raise ValueError(f"goal must be finite, got {goal}")
         for name in ("stage_weight", "terminal_weight", "control_weight"):
             weight = known(getattr(self, name))
-            if weight is not None and not (weight >= 0).all():
-                raise ValueError(f"{name} must be at least 0, got {weight}")
+            if weight is not None and not ((weight >= 0) & (weight < np.inf)).all():
+                raise ValueError(f"{name} must be at least 0 and finite, got {weight}")
 
     def residuals(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, " residuals"]:
         away = self._weighted("stage_weight", self._away(system, state))
@@ -343,8 +358,7 @@ def _model(cost: Cost, function: Callable[[Array], Array], at: Float[Array, " bo
     if isinstance(cost, LeastSquares):
         value, jacobian = function(at), jax.jacfwd(function)(at)
         return Quadratic(jacobian.T @ value, jacobian.T @ jacobian)
-    if shape := jax.eval_shape(function, at).shape:
-        raise ValueError(f"stage and terminal of a cost must return one number each, got shape {shape}")
-    hessian = jax.hessian(function)(at)
+    number = lambda change: as_scalar(function(change), "stage or terminal of a cost")  # noqa: E731
+    hessian = jax.hessian(number)(at)
     values, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
-    return Quadratic(jax.grad(function)(at), (vectors * jnp.maximum(values, 0)) @ vectors.T)
+    return Quadratic(jax.grad(number)(at), (vectors * jnp.maximum(values, 0)) @ vectors.T)

@@ -4,14 +4,15 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, Real
 
-from mjxgrad._arrays import instance, known, one_key
+from mjxgrad._arrays import instance, is_known, known, one_key, real, traceable
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
@@ -209,7 +210,7 @@ class Problem(eqx.Module):
 def optimise_trajectory(
     system: System,
     cost: Cost,
-    start: Float[ArrayLike, " state"],
+    start: Real[ArrayLike, " state"],
     controls: Float[ArrayLike, "horizon m"],
     key: PRNGKeyArray,
     *,
@@ -250,8 +251,9 @@ def optimise_trajectory(
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
     one_key(key)
-    problem, controls, factors = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
-    return _improved(problem, jnp.asarray(start), controls, *factors)
+    problem, begin, controls, factors = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
+    with traceable("cost"):
+        return _improved(problem, begin, controls, *factors)
 
 
 def posed(
@@ -261,11 +263,11 @@ def posed(
     controls: ArrayLike,
     key: PRNGKeyArray,
     smoother: Smoother,
-    schedules: Sequence[ArrayLike],
+    schedules: Sequence[Any],
     lower: ArrayLike | None,
     upper: ArrayLike | None,
-) -> tuple[Problem, _Controls, list[Float[Array, " iterations"]]]:
-    """Return the problem, controls and schedules as arrays; refuse what does not fit, and warn of unwanted smoothing.
+) -> tuple[Problem, StateVector, _Controls, list[Float[Array, " iterations"]]]:
+    """Return the problem, start, controls and schedules as arrays; refuse what does not fit, and warn of unwanted smoothing.
 
     A start of None is the system's origin.
     """
@@ -274,14 +276,14 @@ def posed(
         raise ValueError("system must have controls to plan, got none: give the scene actuators")
     instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
     instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
-    start = system.origin if start is None else jnp.asarray(start)
-    for message in smoother.warnings(system, start):
+    begin = _start(system, start)
+    for message in smoother.warnings(system, begin):
         warnings.warn(message, stacklevel=3)
     sequence_of(controls, None, None, system.num_controls)
-    dtype, shape, own = start.dtype, (system.num_controls,), system.control_limits
-    controls, factors = jnp.asarray(controls, dtype), [jnp.asarray(one, dtype) for one in schedules]
-    lower = jnp.broadcast_to(jnp.asarray(own[0] if lower is None else lower, dtype), shape)
-    upper = jnp.broadcast_to(jnp.asarray(own[1] if upper is None else upper, dtype), shape)
+    dtype, own = begin.dtype, system.control_limits
+    controls, factors = jnp.asarray(controls, dtype), [real("schedule", one, dtype) for one in schedules]
+    lower = per_control("lower", own[0] if lower is None else lower, system, dtype)
+    upper = per_control("upper", own[1] if upper is None else upper, system, dtype)
     for one in factors:
         if one.ndim != 1 or not one.size:
             raise ValueError(f"schedule must be one factor per iteration, at least one, got shape {one.shape}")
@@ -290,7 +292,27 @@ def posed(
     low, high = known(lower), known(upper)
     if low is not None and high is not None and not (low <= high).all():
         raise ValueError(f"lower must be at most upper, got {low} and {high}")
-    return Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper), controls, factors
+    return Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper), begin, controls, factors
+
+
+def _start(system: System, start: ArrayLike | None) -> StateVector:
+    """Return the first state as floats."""
+    if start is None:
+        return system.origin
+    begin, origin = real("start", start), system.origin
+    if begin.shape != origin.shape:
+        raise ValueError(f"start must have shape {origin.shape} in this system, got {begin.shape}")
+    if is_known(begin) and not np.isfinite(begin).all():
+        raise ValueError(f"start must be finite, got {np.asarray(begin).tolist()}")
+    return begin if jnp.issubdtype(begin.dtype, jnp.floating) else begin.astype(origin.dtype)
+
+
+def per_control(name: str, value: ArrayLike, system: System, dtype: Any) -> ControlVector:
+    """Return one number for each control."""
+    numbers, size = real(name, value, dtype), system.num_controls
+    if numbers.shape not in ((), (size,)):
+        raise ValueError(f"{name} must be one number or have shape ({size},), got {numbers.shape}")
+    return jnp.broadcast_to(numbers, (size,))
 
 
 @compiled

@@ -100,6 +100,25 @@ def test_a_moved_goal_is_planned_for_and_compiles_nothing(controller, compilatio
     assert len(compilations) == num_programs
 
 
+def test_a_cost_of_another_form_needs_a_new_controller(controller):
+    with pytest.raises(ValueError, match="make a new Controller for a cost of another form"):
+        controller.cost = GoalCost(jnp.zeros(2), jnp.ones(2), 10.0, 0.1)
+    assert controller.cost is COST
+
+
+@pytest.mark.parametrize("state", [None, "now", ["a", "b"], [[1.0], [2.0, 3.0]]])
+def test_what_is_no_state_is_refused(controller, state):
+    with pytest.raises(ValueError, match="state must be a vector, or for a scene its State or C MuJoCo's data, got"):
+        controller(state)
+
+
+def test_a_start_of_whole_numbers_is_one_of_floats(controller):
+    given, how = (controller.system, COST), {"smoother": Exact(), "schedule": np.ones(5), "upper": 2.0}
+    starts = np.array([1, 0]), np.array([1.0, 0.0])
+    costs = [optimise_trajectory(*given, start, GIVEN, jax.random.key(0), **how).cost for start in starts]
+    assert costs[0] == costs[1]
+
+
 @pytest.mark.parametrize("gradient", [mg.Discrete, mg.Slope])
 def test_a_scene_is_planned_by_c_mujoco_as_by_mjx(gradient):
     """A ball on a spring, two steps: the end, and its linear model up to the rounding of C's differences."""
