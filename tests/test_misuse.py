@@ -582,11 +582,11 @@ FOUND = {
         "the policy must compute with jax.numpy",
     "(env := Rewarded(limited, seen=[1, 2])).step(env.reset(key), [0.0])": "no error",
     # What plans are made of.
-    "planning.optimise_trajectory(system, Leaving(), jnp.zeros(3), np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
+    "planning.optimise_trajectory(system, Leaving(), jnp.zeros(3), np.eye(2), key, smoother=planning.Exact(), schedule=[1])":
         "start must have shape (2,) in this system, got (3,)",
     "planning.optimise_trajectory(system, Leaving(), state, np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
         "start must be real numbers, got State",
-    "planning.optimise_trajectory(system, Leaving(), [0, jnp.nan], np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
+    "planning.optimise_trajectory(system, Leaving(), [0, jnp.nan], np.eye(2), key, smoother=planning.Exact(), schedule=[1])":
         "start must be finite, got [0.0, nan]",
     "planning.optimise_trajectory(system, Leaving(), [0, 0], np.zeros((3, 2)), key, smoother=planning.Exact(), schedule=[1])":
         "cost must compute with jax.numpy",
