@@ -1,5 +1,6 @@
 """The command line: `python -m experiments run FILE.toml [key=value ...]`, `list`, `gallery` and the benchmarks."""
 
+import importlib.metadata
 import signal
 import sys
 import tomllib
@@ -14,6 +15,7 @@ from experiments.runner import run_file, write_gallery
 app = cyclopts.App(
     name="python -m experiments",
     help="Run experiments on mjxgrad, and benchmarks of it.",
+    version=lambda: importlib.metadata.version("mjxgrad"),
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )

@@ -77,7 +77,9 @@ def load_runs(file: str, overrides: list[str]) -> list[Run]:
 
 
 def _load(path: Path, text: str, table: dict[str, Any], overrides: list[str]) -> list[Run]:
-    problems = [problem for item in overrides if (problem := _apply(table, item))]
+    keys = [item.partition("=")[0].strip() for item in overrides]
+    problems = [f"{key}: given twice" for i, key in enumerate(keys) if key in keys[:i]]
+    problems += [problem for item in overrides if (problem := _apply(table, item))]
     sweep, sweep_problems = _take_sweep(table)
     question, expected = read_header(text)
     runs = []
@@ -206,11 +208,11 @@ def _apply(table: dict[str, Any], override: str) -> str | None:
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
     except ValueError:
-        # A shell eats the quotes of a TOML string, so a bare word stands for one, alone or in a list.
+        # A shell eats the quotes of a TOML string, so what begins as a word or a path stands for one, alone or in a list.
         words = value[1:-1].split(",") if value.startswith("[") and value.endswith("]") else [value]
         words = [word.strip() for word in words]
-        if not all(re.fullmatch(r"(\.{0,2}/)?[A-Za-z_][\w./:-]*", word) for word in words):
-            return f"{override}: {value or 'nothing'} is not a TOML value"
+        if not all(re.fullmatch(r"(\.{0,2}/)?[^\W\d].*", word) for word in words):
+            return f"{override}: {value or 'nothing'} is not a TOML value; write a text as '{key}=\"text\"'"
         parsed = words if value.startswith("[") else value
     if isinstance(table.get("sweep"), dict):
         table["sweep"].pop(key, None)

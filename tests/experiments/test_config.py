@@ -82,7 +82,8 @@ def test_an_array_that_is_too_short_for_its_own_mistakes_alone_is_not_called_so(
         ("seed=[1", "seed=[1: [1 is not a TOML value"),
         ("seed", "seed: not an override; write key=value"),
         ("seed=", "seed=: nothing is not a TOML value"),
-        ("seed==1", "seed==1: =1 is not a TOML value"),
+        ("seed==1", "seed==1: =1 is not a TOML value; write a text as 'seed=\"text\"'"),
+        ("task=/tmp/my scène ☃ #1%.xml", 'task: there is no "/tmp/my scène ☃ #1%.xml"'),
         ("--seed=1", '--seed: unknown key; did you mean "seed"?'),
         ("angles=0.1", "angles: must be array, got 0.1"),
         ("video=true", "video: must be an object, got true"),
@@ -101,6 +102,10 @@ def test_overrides_are_toml_and_a_bare_word_is_a_string(write):
     assert run.settings.stiffness == (10.0, 1000.0)
     assert run.settings.video.angles == (0.2,)
     assert run.settings.include_default is False
+
+
+def test_a_key_is_overridden_once(write):
+    assert mistakes(write(VALID), "seed=1", "seed = 2") == ("seed: given twice",)
 
 
 def test_bare_words_in_a_list_are_strings():
