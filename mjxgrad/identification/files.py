@@ -7,7 +7,7 @@ import functools
 import os
 import re
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,8 @@ def parameter(scene: Scene, text: str) -> Parameter:
         raise ValueError(f"bounds must be numbers, low..high, got {text!r}") from error
     if kind == "delay":
         low, high = bounds or (0.0, 0.05)
+        if names or low < 0:
+            raise ValueError(f"delay must be of all controls and at least 0 s, delay or delay=low..high, got {text!r}")
         return Parameter(low, low, high, unit="s")
     if kind == "friction" or kind in _SOFTNESS:
         pairs = tuple(tuple(name.split("/")) for name in names if "/" in name)
@@ -65,6 +67,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
     if not names:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
     if is_field:
+        if (shape := numbers_of(scene.model)[field].shape)[1:] and not column:
+            columns = f"a column from 0 to {shape[1] - 1}, such as {field}[{shape[1] - 1}]:{match[2]}"
+            raise ValueError(f"{field} must have {columns}; got {text!r}")
         return parameters.number(scene, field, *names, column=int(column) if column else None, bounds=bounds)
     if kind in _NAMED:
         return getattr(parameters, kind)(scene, *names, bounds=bounds)
@@ -89,7 +94,8 @@ def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tu
         ValueError: if the file has another form, no time, no measurement, or lacks the control of an actuator; if the noise
             is not positive, or not that of all measured columns.
     """
-    columns = _read(Path(path))
+    places, unknown = _places(scene.mj_model), []
+    columns = _read(Path(path), {"time", *places})
     times = columns.pop("time", None)
     if times is None:
         raise ValueError(f"{path} must have a column named time (s), got {', '.join(columns) or 'nothing'}")
@@ -97,7 +103,6 @@ def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tu
         raise ValueError(f"{path} must have at least two rows of numbers, got {len(times)}")
     if late := np.flatnonzero(~(np.diff(times) > 0)).tolist():
         raise ValueError(f"time in {path} must increase, got {times[late[0]]:g}, then {times[late[0] + 1]:g}")
-    places, unknown = _places(scene.mj_model), []
     found: dict[str, np.ndarray] = {}
     for name, column in columns.items():
         place = places.get(name, ())
@@ -132,13 +137,17 @@ def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tu
     return Recording(found, times=at, noise=scale, knows_noise=bool(noise), name=str(path), **driven), tuple(unknown)
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a file by name."""
+def _read(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
+    """Return the columns of a file by name; those that are not known may be of text, and are of NaN."""
     is_npz = path.suffix == ".npz"
     try:
-        found = _read_npz(path) if is_npz else _read_csv(path)
+        found = _read_npz(path) if is_npz else _read_csv(path, known)
     except (ValueError, TypeError, AttributeError, EOFError, csv.Error, zipfile.BadZipFile) as error:
-        form = "an NPZ with arrays of numbers" if is_npz else "a line of names, then numbers separated by commas"
+        form = (
+            "an NPZ with arrays of numbers"
+            if is_npz
+            else "a line of names, then numbers with decimal points, separated by commas"
+        )
         raise ValueError(f"{path} must be {form}: {error}") from error
     if len({len(column) for column in found.values()}) > 1:
         raise ValueError(f"columns of {path} must be as long as time, got { ({n: len(c) for n, c in found.items()}) }")
@@ -154,20 +163,27 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     return {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
 
 
-def _read_csv(path: Path) -> dict[str, np.ndarray]:
+def _read_csv(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
     with path.open(encoding="utf-8-sig", newline="") as file:
-        names, *rows = [row for row in csv.reader(file) if row] or [[]]
+        reader = csv.reader(file)
+        (first, names), *rows = [(reader.line_num, row) for row in reader if row] or [(1, [""])]
+    names = [name.strip() for name in names]
+    if names[0].startswith("#"):
+        raise ValueError(f"line {first} is a comment, not names")
+    if len(names) == 1 and (marks := [mark for mark in ";\t" if mark in names[0]]):
+        raise ValueError(f"its cells are separated by {marks[0]!r}")
     if twice := [name for i, name in enumerate(names) if name in names[:i]]:
         raise ValueError(f"{', '.join(twice)} stands there more than once")
     numbers = []
-    for line, row in enumerate(rows, 2):
+    for line, row in rows:
         if len(row) != len(names):
             raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")
         try:
-            numbers.append([float(cell) if cell.strip() else np.nan for cell in row])
+            cells = zip(names, row, strict=True)
+            numbers.append([float(cell) if cell.strip() and name in known else np.nan for name, cell in cells])
         except ValueError as error:
             raise ValueError(f"line {line}: {error}") from None
-    return dict(zip(map(str.strip, names), np.reshape(numbers, (len(rows), len(names))).T, strict=True))
+    return dict(zip(names, np.reshape(numbers, (len(rows), len(names))).T, strict=True))
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:

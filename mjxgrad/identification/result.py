@@ -34,6 +34,7 @@ _REMOVED = 1e-3  # of the residuals at the start: less comes from numerical diff
 _ENOUGH = 30  # numbers: fewer are as correlated by chance once in a hundred times
 _DEPARTS = 2.0  # of what is left of the fitted motions
 _BETTER = 0.8  # of the first residuals
+_LITTLE = 0.01  # of the motion, where no noise is stated: what sensors with errors of a hundredth of their range leave
 _OVERSTATED = 0.7  # of the noise: 30 numbers have less by chance once in a hundred times
 CHANCE = 1e-4  # probability that residuals as large are noise
 _NO_PART = 1e-4  # largest share of a determined number in undetermined directions
@@ -155,16 +156,23 @@ class Identification(Printed):
         return self.stopped is Stopped.CONVERGED and is_determined and not self._is_unexplained
 
     @property
+    def is_measured(self) -> bool:
+        """Whether the search got as far as a derivative before an interruption; else the values are the first ones."""
+        return self.stopped is not Stopped.INTERRUPTED or len(self.without_effect) < len(self.names)
+
+    @property
     def _is_unexplained(self) -> bool:
         if self.has_noise and self.num_motions > 1:
             return self.rms[1] > MISFIT
         if self.has_noise:
             return exceeds_noise(self.rms[1], self.num_numbers - len(self.names))
-        return any(after > _BETTER * before for before, after in (self.rms, self.held_out_rms or (1, 0)))
+        return any(after > max(_BETTER * before, _LITTLE) for before, after in (self.rms, self.held_out_rms or (1, 0)))
 
     @property
     def headline(self) -> str:
         """The answer: what was found, how surely, whether it fits, and what it took."""
+        if not self.is_measured:
+            return f"Interrupted before anything was measured; the values are the first ones; {format_number(self.seconds)} s."
         values, halves = (
             np.concatenate([np.ravel(x) for x in part.values()]) for part in (self.values, self.half_width)
         )
@@ -177,7 +185,7 @@ class Identification(Printed):
         if is_lost.any():
             found = f"{count - is_lost.sum()} of {count} numbers found"
         if self._is_unexplained:
-            found = "Not found, for more than noise is left"
+            found = f"Not found, for {'more than noise' if self.has_noise else 'most of the first error'} is left"
         ended = {
             Stopped.STALLED: "Do not trust: stalled",
             Stopped.STEPS: "Cut short",
@@ -253,7 +261,7 @@ class Identification(Printed):
                 f"Residuals follow one another (correlation {self.correlation:.2f} from one time to the next), so something is "
                 f"not as in the scene. {starts}Values may be off by more than their intervals, which assume independent noise."
             )
-        if self.without_effect:
+        if self.without_effect and self.is_measured:
             found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Leave them out.")
         for combination in self.inseparable:
             changes = " with ".join(f"{100 * share:+.2g} % of {name}" for name, share in combination.items())

@@ -45,7 +45,7 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
         "servo": [4, 5, 6],
         "camera": [0, 0, 0],
     }
-    _write(tmp_path / "a.csv", **columns)
+    _write(tmp_path / "a.csv", **columns | {"camera": ["far", "near", "near"]})
     arrays = {name: np.array([np.nan if v == "" else v for v in column]) for name, column in columns.items()}
     del arrays["ctrl:x"], arrays["servo"], arrays["qvel[6]"]
     arrays["ctrl"] = np.array([[1, 4], [2, 5], [3, 6]])
@@ -78,7 +78,9 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
         ({"time": [0, 1], "qpos:palce": [1, 2]}, "qpos:palce, which is not of this scene; did you mean qpos:"),
         ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, np.nan], "servo": [0, 0]}, "it lacks x from 1 s"),
         (bytes(range(256)), "a.csv must be a line of names, then numbers"),
-        (b"time,x\n0,1,2", "line 2 has 3 cells, not 2"),
+        (b"time,x\n\n0,1,2", "line 3 has 3 cells, not 2"),
+        (b"# made by a robot\ntime,x\n0,1", "line 1 is a comment, not names"),
+        (b"time;x\n0;1", "decimal points, separated by commas: its cells are separated by ';'"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_path, columns, said):
@@ -156,7 +158,9 @@ def test_parameters_are_named_in_a_word(scene):
         "mass": "must say of what",
         "gear:no": "no",
         "mass:cart=-1..1": "negative",
-        "body_pos:cart": "column of body_pos must be from 0 to 2, got None",
+        "body_pos:cart": r"body_pos must have a column from 0 to 2, such as body_pos\[2\]:cart",
+        "delay:servo": "delay must be of all controls and at least 0 s",
+        "delay=-1..2": "delay must be of all controls and at least 0 s",
         "opt.timestep": "kind one of mass",
     }
     for wrong, said in refused.items():
