@@ -89,6 +89,7 @@ except AttributeError as error:
         f"MuJoCo's MJX takes {next(iter(getattr(other, '__path__', ['warp.py'])))} for NVIDIA Warp: rename it ({error})"
     ) from None
 finally:
-    sys.stdout.writelines(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE))
+    # By `print`, for a closed stdout is None.
+    print(*(line for line in _said.getvalue().splitlines(keepends=True) if not line.startswith(_NOISE)), sep="", end="")
 
 MJX_VERSION = importlib.metadata.version("mujoco-mjx")

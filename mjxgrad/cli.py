@@ -1,10 +1,13 @@
 """The command line: check and sweep a scene, find its parameters, begin a program."""
 
+import contextlib
 import dataclasses
 import functools
 import importlib
 import importlib.util
+import io
 import os
+import shlex
 import signal
 import sys
 import time
@@ -25,6 +28,8 @@ except ImportError:
 _ONE = 0.3  # s within which signals are one: `timeout` sends its own twice
 Switch = Annotated[bool, cyclopts.Parameter(negative="")]
 Whole = Annotated[int, cyclopts.Parameter(converter=lambda _, tokens: int(tokens[0].value))]  # cyclopts would round 1.5
+Folder = Annotated[Path, cyclopts.Parameter(converter=lambda _, tokens: _folder(tokens[0].value))]
+Several = cyclopts.Parameter(consume_multiple=1, negative="")  # values after one option, at least one
 
 
 class CommandError(Exception):
@@ -56,12 +61,17 @@ def main(arguments: list[str] | None = None) -> int:
         if not is_first and now - interruptions[0] < _ONE:
             return
         interruptions.append(now)
-        os.write(2, b"interrupted: writing what there is; once more ends at once\n" if is_first else b"interrupted\n")
+        with contextlib.suppress(OSError):  # a closed pipe
+            os.write(
+                2, b"interrupted: writing what there is; once more ends at once\n" if is_first else b"interrupted\n"
+            )
         if not is_first:
             os._exit(130)
         raise KeyboardInterrupt
 
     former = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal without ± costs no result
+        sys.stdout.reconfigure(errors="backslashreplace")
     status, warnings.formatwarning = 2, lambda message, *_, **__: f"{message}\n"  # without a line of the library's code
     try:
         status = app(arguments, exit_on_error=False, print_error=False) or 0
@@ -71,9 +81,10 @@ def main(arguments: list[str] | None = None) -> int:
         _say("interrupted")
         status = 130
         if arguments is None:  # as a command: nobody waits for work in other threads
-            sys.stdout.flush()
+            with contextlib.suppress(AttributeError, BrokenPipeError):  # a closed stdout
+                sys.stdout.flush()
             os._exit(status)
-    except BrokenPipeError:  # the reader has closed the pipe
+    except BrokenPipeError:  # the reader of --help has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         status = 0
     except cyclopts.CycloptsError as error:
@@ -88,8 +99,18 @@ def main(arguments: list[str] | None = None) -> int:
     return status
 
 
+def _print(text: str, stream: Any) -> None:
+    """Print at once; where the stream or its reader is closed, the work goes on for its exit status and its files."""
+    if stream is None:
+        return
+    try:
+        print(text, file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    _print(text, sys.stderr)
 
 
 def _timed() -> Callable[[str], None]:
@@ -120,12 +141,12 @@ def check(
         budget: duration in s, about; the report names measurements that are left out.
         seed: seed of all random numbers.
     """
-    _writable(html, is_page=True)
+    _writable(html, is_page=True, beside=(scene, _source(cost)))
     log = _timed()
     log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()
     verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
-    print(finished(verdict.summary), flush=True)
+    _print(finished(verdict.summary), sys.stdout)
     if html is not None:
         finished(lambda: write(html, verdict.as_html()))
         log(f"wrote {html}")
@@ -139,7 +160,7 @@ def sweep(
     cost: str | None = None,
     start: str | None = None,
     horizon: Whole | None = None,
-    stiffness: Annotated[list[float] | None, cyclopts.Parameter(consume_multiple=True, negative="")] = None,
+    stiffness: Annotated[list[float] | None, Several] = None,
     noise: float = 0.1,
     samples: Whole = 256,
     gradient: Literal["slope", "discrete"] | None = None,
@@ -164,7 +185,7 @@ def sweep(
         seed: seed of all random numbers.
         html: the page to write.
     """
-    _writable(html, is_page=True)
+    _writable(html, is_page=True, beside=(scene, _source(cost)))
     log = _timed()
     mg = _library()
     given = {} if stiffness is None else {"stiffness": stiffness}
@@ -172,7 +193,7 @@ def sweep(
     given |= {"start": start, "horizon": horizon, "engine": engine}
     given |= {"contact": mg.stepping.own_motion(gradient) if gradient else None}
     found = mg.sweep(_existing(scene), cost, **given)
-    print(finished(lambda: str(found)), flush=True)
+    _print(finished(lambda: str(found)), sys.stdout)
     finished(lambda: write(html, found.as_html()))
     log(f"wrote {html}")
 
@@ -181,12 +202,12 @@ def sweep(
 def identify(
     scene: str,
     *recordings: str,
-    parameter: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")],
-    noise: Annotated[list[str], cyclopts.Parameter(consume_multiple=True, negative="")] = [],  # noqa: B006
+    parameter: Annotated[list[str], Several],
+    noise: Annotated[list[str], Several] = [],  # noqa: B006
     held_out: float = 0.2,
     start: Literal["noisy", "exact", "free"] = "noisy",
-    max_steps: int = 100,
-    output: Path = Path("identified"),
+    max_steps: Whole = 100,
+    output: Folder = Path("identified"),
 ) -> int:
     """Find masses, friction, gains of a scene from recorded motions; the exit status is 1 where a value was not found.
 
@@ -210,11 +231,14 @@ def identify(
         max_steps: largest number of derivatives; ensembles of many motions are not counted.
         output: folder for params_x_hat.yaml, identified.xml and report.html.
     """
-    _writable(output / "report.html", makes_folder=True, is_page=True)
+    for name in ("params_x_hat.yaml", "identified.xml", "report.html"):
+        _writable(output / name, makes_folder=True, is_page=True, beside=(scene, *recordings))
     mg, log = _library(), _timed()
     files, page = (importlib.import_module(f"mjxgrad.identification.{name}") for name in ("files", "page"))
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
+    if len({os.path.realpath(path) for path in recordings}) < len(recordings):
+        raise CommandError(f"each recording must be named once, got {' '.join(recordings)}")
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         loaded = mg.load_scene(_existing(scene), keep_everything=True)
@@ -238,6 +262,10 @@ def identify(
         motions.append(dataclasses.replace(one, start=mg.initial_state(loaded)) if start == "exact" else one)
     fitted, judged = files.hold_out(motions, held_out)
     several = lambda many, word: f"{len(many)} {word}{'s' * (len(many) != 1)}"  # noqa: E731
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CommandError(f"{output} cannot be made: {error.strerror}") from error
     log(f"{several(wanted, 'parameter')}, {several(fitted, 'motion')} to fit, {len(judged)} held out")
     given = {"delay": "delay" if "delay" in wanted else None, "free_start": True if start == "free" else None}
     log(mg.identification.outlook(loaded, wanted, fitted, **given).summary())
@@ -247,10 +275,11 @@ def identify(
         log(f"step {step}: error {metrics['rms']:.3g} {unit}{part}, about {metrics['seconds']:.0f} s to go")
 
     result = mg.identify(loaded, wanted, fitted, held_out=judged, max_steps=max_steps, log=say, **given)
-    output.mkdir(parents=True, exist_ok=True)
+    _print(finished(lambda: "\n".join([result.headline, "", result.summary(), *left_out])), sys.stdout)
+    if not result.is_measured:
+        return 1
     finished(lambda: result.save(output / "params_x_hat.yaml"))
     finished(lambda: files.write_xml(loaded, result.scene, scene, output / "identified.xml"))
-    print(finished(lambda: "\n".join([result.headline, "", result.summary(), *left_out])), flush=True)
     log(f"wrote {output}/params_x_hat.yaml, identified.xml")
     text = finished(lambda: page.identified_page(Path(scene).name, loaded, result, fitted, judged))
     write(output / "report.html", text)
@@ -267,15 +296,20 @@ def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) ->
         output: the program to write.
         force: overwrite an existing program.
     """
+    if output.suffix != ".py":  # of the same name with .mp4 is its film
+        raise CommandError(f"{output} must be named as a program, such as {output.with_suffix('.py')}")
     if output.exists() and not force:
         raise CommandError(f"{output} exists already; name another --output, or replace it with --force")
-    _writable(output)
+    _writable(output, beside=(scene,))
     verdict = _library().check(_existing(scene), derivatives=False)
     if not verdict.scene.model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     program = importlib.import_module("mjxgrad.checking.check").program
     write(output, program(verdict, str(Path(scene)), str(output.with_suffix(".mp4"))))
-    print(f"{verdict.headline}\nwrote {output}: write your cost into it, then python {output}")
+    _print(
+        f"{verdict.headline}\nwrote {output}: write your cost into it, then {shlex.join(['python', str(output)])}",
+        sys.stdout,
+    )
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")
 
@@ -291,8 +325,9 @@ def _library() -> Any:
     try:
         all_devices()
     except (AssertionError, RuntimeError) as error:  # JAX asserts where JAX_PLATFORMS names a missing platform
-        asked = os.environ.get("JAX_PLATFORMS", "")
-        raise CommandError(f"JAX finds no device of JAX_PLATFORMS={asked}: unset it {error}".rstrip()) from error
+        asked = os.environ.get("JAX_PLATFORMS")
+        of = f" of JAX_PLATFORMS={asked}: unset it" if asked else ":"
+        raise CommandError(f"JAX finds no device{of} {error}".rstrip(" :")) from error
     library = importlib.import_module("mjxgrad")
     library.keep_compiled()
     return library
@@ -306,16 +341,32 @@ def _number(text: str) -> tuple[str, float]:
         raise CommandError(f"--noise must be name=number, got {text}") from None
 
 
+def _folder(name: str) -> Path:
+    if not name:
+        raise ValueError("it must be named")  # Path('') is the current folder
+    return Path(name)
+
+
 def _existing(path: str) -> str:
     if not Path(path).is_file():
         raise CommandError(f"there is no file {path}")
     return path
 
 
-def _writable(path: Path | None, *, makes_folder: bool = False, is_page: bool = False) -> None:
-    """Refuse in advance an output file that cannot be written, or a page without the packages for pages."""
+def _source(cost: str | None) -> str:
+    """Return the file of a cost, should it be in one."""
+    source = (cost or "").rpartition(":")[0]
+    return source if source.endswith(".py") else f"{source.replace('.', '/')}.py"
+
+
+def _writable(
+    path: Path | None, *, makes_folder: bool = False, is_page: bool = False, beside: tuple[str, ...] = ()
+) -> None:
+    """Refuse in advance an output that cannot be written, would replace an input, or is a page without packages for pages."""
     if path is None:
         return
+    if replaced := [one for one in beside if path.exists() and Path(one).exists() and path.samefile(one)]:
+        raise CommandError(f"{path} would replace {replaced[0]}, which is read; name another output")
     folders = path.absolute().parents
     there = next(folder for folder in folders if folder.exists()) if makes_folder else folders[0]
     if path.exists() and not path.is_file():

@@ -1,6 +1,8 @@
 """The command line: what it prints where, its exit codes, and what it writes."""
 
 import contextlib
+import io
+import os
 import signal
 import subprocess
 import sys
@@ -24,6 +26,7 @@ def count(trajectory):
 def root(trajectory):
     return jnp.sqrt(0 * trajectory.qpos[-1, 0])
 def wrong(t): return t.pos
+def stop(t): raise SystemExit
 """
 _IDENTIFY = ["identify", "scene.xml", "motion.csv", "--parameter", "mass:ball"]
 
@@ -57,13 +60,23 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
         (
             ["check", "scene.xml", "--quick", "--cost", "costs.py:wrong"],
-            "'costs.py:wrong' raised AttributeError: 'Trajectory' object",
+            "'costs.py:wrong' raised AttributeError: 'Trajectory' object has no attribute 'pos'\n",
         ),
+        (
+            ["check", "scene.xml", "--quick", "--cost", "costs.py:stop"],
+            "'costs.py:stop' ended the program; put what it",
+        ),
+        (["check", "scene.xml", "--quick", "--cost", "jax.numpy:sinus"], "no function 'sinus', but sin, "),
+        ([*_IDENTIFY, "--max-steps", "1.5"], "invalid literal for int() with base 10: '1.5'"),
+        ([*_IDENTIFY, "--noise"], "--noise requires at least 1"),
+        ([*_IDENTIFY, "--output", ""], "must be named"),
+        ([*_IDENTIFY, "--output", "/proc/found"], "/proc/found"),
+        ([*_IDENTIFY[:3], "./motion.csv", *_IDENTIFY[3:]], "each recording must be named once"),
         (["check", "scene.xml", "--quick", "--seed", "1.5"], "invalid literal for int() with base 10: '1.5'"),
         ([*_IDENTIFY, "mass:ball=1..2"], "--parameter must name each parameter once"),
         ([*_IDENTIFY[:2], "twice.csv", *_IDENTIFY[3:]], "z stands there more than once"),
         (["chek"], 'Did you mean "check"'),
-        (["new", "scene.xml", "--output", "scene.xml"], "--force"),
+        (["new", "scene.xml", "--output", "costs.py"], "--force"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said):
@@ -72,8 +85,9 @@ def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said)
     Path("motion.csv").write_text("time,z,push\n0,0,0\n.1,0,0\n")
     Path("twice.csv").write_text("time,z,z,push\n0,0,0,0\n")
     assert cli.main(arguments) == 2
-    *_, line = capsys.readouterr().err.splitlines()
+    *_, line = capsys.readouterr().err.splitlines(keepends=True)
     assert said in line
+    assert len(line) < 500
     assert "Traceback" not in line
 
 
@@ -105,6 +119,24 @@ def test_a_full_disk_costs_neither_the_answer_nor_what_was_there(scene, capsys, 
     assert Path("page.html").read_text() == "before"
 
 
+def test_a_reader_who_is_gone_costs_neither_the_page_nor_the_exit_code(scene, capsys, monkeypatch):
+    """A closed pipe, closed streams, and a terminal that lacks the signs of the answer."""
+    Path(scene).write_text(SCENE.format(gear=0))  # a fault
+    read, wrote = os.pipe()
+    os.close(read)
+    with os.fdopen(wrote, "w") as pipe:
+        for stream in (pipe, None):
+            with monkeypatch.context() as patch:
+                patch.setattr(sys, "stdout", stream)
+                patch.setattr(sys, "stderr", stream)
+                assert cli.main(["check", scene, "--quick", "--html", "page.html"]) == 1
+            Path("page.html").unlink()
+    with io.TextIOWrapper(io.BytesIO(), encoding="ascii") as terminal:
+        monkeypatch.setattr(sys, "stdout", terminal)
+        assert cli.main(["check", scene, "--quick"]) == 1
+        assert b"No effect: actuator 'push'" in terminal.buffer.getvalue()
+
+
 def test_an_interruption_ends_in_one_line(scene, capsys, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
@@ -123,6 +155,11 @@ _SWEEP = ["sweep", "scene.xml", "--samples", "64", "--horizon", "20", "--engine"
         (_SWEEP, "2 of 6", "Interrupted after 33% of the rollouts, at 2 of 3 stiffnesses."),
         (_SWEEP, "3 of 6", "Interrupted after 50% of the rollouts, at 3 of 3 stiffnesses."),
         ([*_IDENTIFY[:4], "gear:push"], "step 1:", "Interrupted, best so far"),
+        (
+            [*_IDENTIFY[:4], "gear:push"],
+            "step 0:",
+            "Interrupted before anything was measured; the values are the first ones",
+        ),
         (["check", "scene.xml"], "derivatives over", "Derivatives were not measured"),
     ],
 )
@@ -140,7 +177,7 @@ def test_an_interrupted_command_prints_and_writes_what_it_has_measured(
     assert said in told.out
     assert told.err.endswith("interrupted\n")
     assert Path("sweep.html").exists() == (arguments[0] == "sweep")
-    assert Path("identified/report.html").exists() == (arguments[0] == "identify")
+    assert Path("identified/report.html").exists() == (at == "step 1:")
 
 
 def test_a_signal_that_is_sent_twice_at_once_is_one(scene, capsys, monkeypatch):
@@ -274,6 +311,27 @@ _PAGE = "a page needs jinja2, not installed: pip install 'mjxgrad[render]'\n"
     [
         (["check", "scene.xml", "--html", "nowhere/page.html"], "nothing", "cannot be written"),
         (["new", "scene.xml", "--output", "nowhere/task.py"], "nothing", "cannot be written"),
+        (
+            ["new", "scene.xml", "--output", "task.mp4"],
+            "nothing",
+            "task.mp4 must be named as a program, such as task.py",
+        ),
+        (
+            ["new", "task.py", "--output", "task.py", "--force"],
+            "nothing",
+            "task.py would replace task.py, which is read",
+        ),
+        (
+            ["check", "scene.xml", "--html", "./scene.xml"],
+            "nothing",
+            "scene.xml would replace scene.xml, which is read",
+        ),
+        (
+            ["sweep", "scene.xml", "--cost", "task.py:a", "--html", "task.py"],
+            "nothing",
+            "task.py would replace task.py",
+        ),
+        (["identify", "identified.xml", *_IDENTIFY[2:], "--output", "."], "nothing", "would replace identified.xml"),
         ([*_IDENTIFY, "--output", "scene.xml"], "nothing", "cannot be written"),
         (["check", "scene.xml", "--html", "page.html"], "jinja2", _PAGE),
         (["sweep", "scene.xml"], "jinja2", _PAGE),
@@ -281,6 +339,8 @@ _PAGE = "a page needs jinja2, not installed: pip install 'mjxgrad[render]'\n"
     ],
 )
 def test_what_could_not_be_written_is_refused_before_the_work(scene, capsys, monkeypatch, arguments, missing, said):
+    for name in ("identified.xml", "task.py"):
+        Path(name).write_text("kept")
     monkeypatch.setattr(cli, "_library", lambda: pytest.fail("the work was begun"))
     monkeypatch.setitem(sys.modules, missing, None)
     assert cli.main(arguments) == 2

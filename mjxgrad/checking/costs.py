@@ -21,6 +21,7 @@ from mjxgrad.scene import Scene
 
 Cost = Callable[[Trajectory], Float[Array, "..."]]
 _BUILT_IN = {"height": 1, "speed": 1, "upright": 1, "reach": 2}  # costs, and the number of bodies or sites of each
+_SHOWN = 10  # functions of a file
 
 
 def named_cost(scene: Scene, name: str) -> Cost:
@@ -64,8 +65,10 @@ def _function(name: str) -> Callable[..., Any]:
         sys.path.insert(0, str(Path.cwd()))
         names = runpy.run_path(source) if source.endswith(".py") else vars(importlib.import_module(source))
     if not callable(names.get(function)):
-        there = ", ".join(key for key, one in names.items() if callable(one) and not key.startswith("_"))
-        raise ValueError(f"cost: {source} has no function {function!r}, but {there or 'none'}")
+        there = [key for key, one in names.items() if callable(one) and not key.startswith("_")]
+        near = (difflib.get_close_matches(function, there, _SHOWN) if len(there) > _SHOWN else there) or there[:_SHOWN]
+        more = f" and {len(there) - len(near)} more" * (len(near) < len(there))
+        raise ValueError(f"cost: {source} has no function {function!r}, but {', '.join(near) or 'none'}{more}")
     return _told(name)(names[function])
 
 
@@ -74,12 +77,17 @@ def _told(name: str) -> Iterator[None]:
     """Put an error in a user's file, which may be any, into a sentence."""
     try:
         yield
+    except SystemExit as error:
+        raise ValueError(
+            f"cost {name!r} ended the program; put what it runs under if __name__ == '__main__'"
+        ) from error
     except Exception as error:
         if isinstance(error, jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError):
             wanted = "must compute with jax.numpy, got NumPy, float() or if on traced numbers"
             raise ValueError(f"cost {name!r} {wanted}") from error
-        forms = "file.py:function, module:function, or of a body as height:torso"
-        raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}; a cost must be {forms}") from error
+        forms = "; a cost must be file.py:function, module:function, or of a body as height:torso"
+        forms *= isinstance(error, ModuleNotFoundError) and error.name == name.rpartition(":")[0]
+        raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}{forms}") from error
 
 
 def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:
