@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import form, function, one_of, traceable, whole
+from mjxgrad._arrays import form, function, instance, one_of, traceable, whole
 from mjxgrad.contact import Softness
 from mjxgrad.engines.state import check_scene
 from mjxgrad.rollouts import Observe, PolicyFunction, Sees, State, Trajectory, rollout
