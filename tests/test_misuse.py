@@ -612,6 +612,45 @@ FOUND = {
         "make a new Controller for a cost of another form",
     "planning.Controller(system, planning.GoalCost(*jnp.ones((3, 2)), 0.1), np.zeros((3, 2)))('now')":
         "state must be a vector, or for a scene its State or C MuJoCo's data, got str",
+    # Recordings and parameters.
+    "fit.Recording({'qpos': 3.0})": "measured of the recording must hold one row per time, by name, got shapes {'qpos': ()}",
+    "fit.Recording({'qpos': np.zeros((5, 1, 1))})": "must hold one row per time, by name, got shapes {'qpos': (5, 1, 1)}",
+    "fit.Recording({'qpos': five}, times=np.arange(5.0)[:, None])": "times of the recording must be finite, one row per time",
+    "fit.Recording({'qpos': five}, u, np.arange(5.0), [0.0, 1.0, 2.0])": "one time per row of controls, got 3 times and 2",
+    "fit.Recording({'qpos': five}, control_times=[0.0, 1.0])": "one time per row of controls, got 2 times and no rows",
+    "stack(scene, [fit.Recording({'qpos': five}, np.zeros((4, 1)), noise={'qpos': [0.1, 0.2]})])":
+        "noise of qpos of the recording must be one number or 1 in this scene, got shape (2,)",
+    "identify(recordings=[fit.Recording({'qpos': five}, np.zeros((4, 1)), start=still)])":
+        "start of the recording must be a state of this scene",
+    "fit.Recording({'qpos': five}).cut('1', 0.002)": "duration must be real numbers, got str",
+    "fit.Recording({'qpos': five}).cut(-1.0, 0.002)": "duration must be positive, got -1.0",
+    "fit.Recording({'qpos': five}).cut(0.004, 0.0)": "timestep must be positive, got 0.0",
+    "mg.identify(scene, {1: fit.Parameter(1.0)}, [fit.Recording({'qpos': five}, np.zeros((4, 1)))])": "by text, got [1]",
+    "fit.Parameter('1')": "nominal must be real numbers, got str",
+    "fit.Parameter(1.0, 0.5, 2.0, write=3)": "write must be a function of model and value, got int",
+    "fit.Parameter(1.0, 0.5, 2.0, write=lambda model: {})": "write must be a function of model and value, got function: too many",
+    "mg.identify(scene, {'a': fit.Parameter(1.0, 0.5, 2.0, lambda m, v: None)}, [fit.Recording({'qpos': five})])":
+        "what write of a returns must be a dict of fields",
+    "mg.identify(scene, dict.fromkeys('ab', fit.damping(scene, 'joint', bounds=(0, 1))), [fit.Recording({'qpos': five})])":
+        "parameters must be of different numbers, got dof_damping of 'a' and 'b'",
+    "fit.mass(scene.mj_model, 'b')": "scene must be of mg.load_scene, got MjModel",
+    "fit.friction(scene.mj_model)": "scene must be of mg.load_scene, got MjModel",
+    "fit.damping(scene, bounds=(0, 1))": "a parameter must have at least one name, got none",
+    "fit.number(hinged, 'jnt_range', 'h', column=0, bounds=(0, 1))": "must be within its bounds, (0, 1), got -1.57",
+    "fit.number(scene, 'body_mas', 'b')": "got 'body_mas'; did you mean body_mass?",
+    # Pictures, and pairs.
+    "mg.render.frames(scene, np.zeros((3, 1)), camera=7)": "camera must be below 0, or -1 for the free camera, got 7",
+    "mg.render.frames(scene, np.zeros((3, 1)), camera=-3)": "camera must be at least -1, got -3",
+    "mg.render.frames(scene, np.zeros((3, 1)), camera=0.5)": "camera must be a whole number, got 0.5",
+    "mg.render.frames(scene, np.zeros((3, 1)), camera=['a'])": "camera must be a whole number, got ['a']",
+    "jax.jit(lambda qpos: mg.render.frames(scene, qpos))(wrong)": "frames must be drawn outside of jax.jit and jax.vmap",
+    "mg.render.write_video('v.mp4', np.full((2, 8, 8, 3), 255.0))": "or floats from 0 to 1, got float64 from 255 to 255",
+    "mg.render.write_video('v.mp4', np.zeros((2, 8, 8, 3), int))": "video must be uint8, as mg.render.frames gives, or floats",
+    "mg.render.write_video('v.mp4', np.full((2, 8, 8, 3), np.nan))": "or floats from 0 to 1, got float64 from nan to nan",
+    "mg.render.write_video('v.mp4', np.zeros((2, 1, 1, 3), np.uint8))": "two columns at least, got shape (2, 1, 1, 3)",
+    "mg.render.write_video('v.mp4', [np.zeros((8, 8, 3)), np.zeros((4, 8, 3))])": "video must have frames of one size",
+    "mg.Softness(pairs=('floor', 'ball'))": "pairs must be pairs of two names, such as (('floor', 'ball'),), got ('floor'",
+    "mg.Softness(pairs=(('a', 'b', 'c'),))": "pairs must be pairs of two names, such as (('floor', 'ball'),), got (('a'",
 }  # fmt: skip
 
 

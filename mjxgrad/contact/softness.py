@@ -82,6 +82,9 @@ class Softness(eqx.Module):
             raise ValueError("Softness takes either geoms or pairs, got geoms and pairs")
         if isinstance(self.geoms, str):
             raise ValueError(f"geoms must be a tuple of names, got {self.geoms!r}; write ({self.geoms!r},)")
+        pairs = () if self.pairs is None else self.pairs
+        if not all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in pairs):
+            raise ValueError(f"pairs must be pairs of two names, such as (('floor', 'ball'),), got {pairs!r}")
         if self.rest_acceleration is not None and self.margin is None:
             raise ValueError("rest_acceleration must come with a margin, got none; give Softness a margin, too")
         for name, (is_valid, requirement) in _REQUIREMENTS.items():

@@ -1,6 +1,7 @@
 """Parameters to identify: named numbers between bounds, and the model fields that each of them changes."""
 
 import dataclasses
+import difflib
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -14,9 +15,11 @@ import scipy.spatial
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from mjxgrad._arrays import function, instance, real, traceable
 from mjxgrad._mjx import mjx
 from mjxgrad.contact import Softness
-from mjxgrad.contact.parameters import Pairs, contact_parameters, deciding_geoms
+from mjxgrad.contact.parameters import ContactParameters, contact_parameters, deciding_geoms
+from mjxgrad.engines.state import check_scene
 from mjxgrad.scene import Scene
 from mjxgrad.stepping.rows import index_of
 
@@ -31,6 +34,7 @@ _OBJECTS = {
 _POSITIVE = ("dof_damping", "dof_armature", "dof_frictionloss", "body_mass", "geom_size", "jnt_stiffness")
 _FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
 _AT_BOUND = 1e-6  # share of the range
+_NEAR = 1e-3  # of a number's scale, by which it is changed to see what follows
 # The bounds of `mujoco.sysid` for inertia: the mass by a factor of 10, stretches by 2, shears by 0.5, the centre by 0.5 m.
 _REACH = np.array([np.log(10) / 2, *[np.log(2) / 2] * 3, *[0.5] * 3, *[0.5] * 3])
 
@@ -55,9 +59,10 @@ class Parameter:
     unit: str = ""
 
     def __post_init__(self):
-        nominal = np.asarray(self.nominal, float)
+        function("write", self.write, "model", "value")
+        nominal = np.asarray(real("nominal", self.nominal), float)
         for name in ("nominal", "lower", "upper"):
-            value = np.asarray(getattr(self, name), float)
+            value = np.asarray(real(name, getattr(self, name)), float)
             if value.ndim and value.shape != nominal.shape:
                 raise ValueError(f"{name} must be one number or of shape {nominal.shape}, got shape {value.shape}")
             object.__setattr__(self, name, np.broadcast_to(value, nominal.shape))
@@ -86,8 +91,8 @@ class Coordinates:
     @classmethod
     def of(cls, parameters: Mapping[str, Parameter]) -> "Coordinates":
         """Return the coordinates of named parameters, at least one."""
-        if not parameters:
-            raise ValueError("parameters must name at least one parameter, got none")
+        if not parameters or not all(isinstance(name, str) for name in parameters):
+            raise ValueError(f"parameters must name at least one parameter, by text, got {list(parameters) or 'none'}")
         joined = lambda part: np.concatenate([getattr(p, part).ravel() for p in parameters.values()])  # noqa: E731
         names = [
             name + "".join(f"[{i}]" for i in place if p.nominal.size > 1)
@@ -144,9 +149,45 @@ def write_all(scene: Scene, parameters: Mapping[str, Parameter], values: Mapping
     model, changed = scene.model, {}
     for name, parameter in parameters.items():
         if parameter.write is not None:
-            fields = parameter.write(model, values[name])
+            fields = _written(model, name, parameter, values[name])
             model, changed = model.replace(**fields), changed | fields
     return scene.with_model(**changed) if changed else scene
+
+
+def check_entries(scene: Scene, parameters: Mapping[str, Parameter]) -> None:
+    """Refuse a parameter of whose numbers a later one writes some anew, so that they would not follow it."""
+    earlier: dict[str, list[dict[str, Array]]] = {}
+    for name, parameter in parameters.items():
+        if parameter.write is None:
+            continue
+        nominal, step = (
+            parameter.nominal,
+            _NEAR * Coordinates.of({name: parameter}).scale.reshape(parameter.nominal.shape),
+        )
+        values = nominal, nominal + np.where(nominal + step <= parameter.upper, step, -step)
+        first, near = (jnp.asarray(value, scene.data.qpos.dtype) for value in values)
+        for other, pair in earlier.items():
+            after = [_written(scene.model.replace(**fields), name, parameter, first) for fields in pair]
+            for field in after[0].keys() & pair[0].keys():
+                is_lost = (pair[0][field] != pair[1][field]) & (after[0][field] == after[1][field])
+                if is_lost.any():
+                    raise ValueError(f"parameters must be of different numbers, got {field} of {other!r} and {name!r}")
+        earlier[name] = [_written(scene.model, name, parameter, value) for value in (first, near)]
+
+
+def _written(model: mjx.Model, name: str, parameter: Parameter, value: Array) -> dict[str, Array]:
+    with traceable(f"write of {name}"):
+        fields = parameter.write(model, value)  # pyright: ignore[reportOptionalCall]
+    instance(f"what write of {name} returns", fields, dict, 'a dict of fields, such as {"dof_damping": ...}')
+    return fields
+
+
+def _indices(scene: Scene, kind: mujoco.mjtObj, *names: str) -> np.ndarray:
+    """Return the numbers of named elements, at least one."""
+    check_scene(scene)
+    if not names:
+        raise ValueError("a parameter must have at least one name, got none")
+    return np.array([index_of(scene.model, kind, name) for name in names])
 
 
 def mass(scene: Scene, *bodies: str, bounds: Bounds = None) -> Parameter:
@@ -164,7 +205,8 @@ def mass(scene: Scene, *bodies: str, bounds: Bounds = None) -> Parameter:
         inertia = model.body_inertia.at[index].set(factor * model.body_inertia[index])
         return {"body_mass": model.body_mass.at[index].set(value), "body_inertia": inertia}
 
-    nominal = float(scene.model.body_mass[index_of(scene.model, _Object.mjOBJ_BODY, bodies[0])])
+    first = _indices(scene, _Object.mjOBJ_BODY, *bodies)[0]
+    nominal = float(scene.model.body_mass[first])
     return _positive(nominal, bounds, write, "kg", "mass")
 
 
@@ -189,8 +231,7 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
             found["geom_friction"] = model.geom_friction.at[geoms, 0].set(value)
         return found
 
-    present = contact_parameters(scene.model, _touching(scene, named)).friction
-    return _positive(float(present[0, 0]), bounds, write, "", "friction")
+    return _positive(float(_touching(scene, named).friction[0, 0]), bounds, write, "", "friction")
 
 
 def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -> Parameter:
@@ -210,13 +251,14 @@ def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -
         fields = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
         return {name: new for name in fields if (new := getattr(after, name)) is not getattr(model, name)}
 
-    present = contact_parameters(scene.model, _touching(scene, Softness(**subset)))
-    return _positive(float(getattr(present, part)[0]), bounds, write, units[part], part)
+    present = getattr(_touching(scene, Softness(**subset)), part)
+    return _positive(float(present[0]), bounds, write, units[part], part)
 
 
-def _touching(scene: Scene, named: Softness) -> Pairs:
+def _touching(scene: Scene, named: Softness) -> ContactParameters:
+    check_scene(scene)
     if found := named.selected(scene.model):
-        return found
+        return contact_parameters(scene.model, found)
     raise ValueError(f"friction and softness need geoms that can touch, got none in {scene.name}")
 
 
@@ -255,13 +297,16 @@ def number(scene: Scene, field: str, *names: str, column: int | None = None, bou
     Raises:
         ValueError: if there is no such field, element or column.
     """
-    start = field.partition("_")[0]
+    check_scene(scene)
+    start = str(field).partition("_")[0]
     if start not in _OBJECTS or not isinstance(value := getattr(scene.model, field, None), jax.Array):
-        raise ValueError(f"field must be one of the model's that begins with {', '.join(_OBJECTS)}, got {field!r}")
+        near = difflib.get_close_matches(str(field), list(vars(scene.model)), 1)
+        told = f"got {field!r}" + "".join(f"; did you mean {one}?" for one in near)
+        raise ValueError(f"field must be one of the model's that begins with {', '.join(_OBJECTS)}, {told}")
     if value.ndim != 1 + (column is not None) or (column is not None and not 0 <= column < value.shape[1]):
         wanted = f"from 0 to {value.shape[1] - 1}" if value.ndim == 2 else "None, for it has one number each"
         raise ValueError(f"column of {field} must be {wanted}, got {column}")
-    index = np.array([index_of(scene.model, _OBJECTS[start], name) for name in names])
+    index = _indices(scene, _OBJECTS[start], *names)
     if start == "dof":
         index = np.flatnonzero(np.isin(scene.model.dof_jntid, index))
     place: Any = index if column is None else (index, column)
@@ -280,7 +325,7 @@ def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None)
     Raises:
         ValueError: if there is no such actuator, it is of another kind, or a gain is zero and no bounds are given.
     """
-    index = index_of(scene.model, _Object.mjOBJ_ACTUATOR, actuator)
+    index = _indices(scene, _Object.mjOBJ_ACTUATOR, actuator)[0]
     gain, bias = (np.asarray(getattr(scene.model, f"actuator_{name}"))[index] for name in ("gainprm", "biasprm"))
     has_bias = scene.mj_model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
     is_position, is_velocity = gain[0] == -bias[1] != 0, gain[0] == -bias[2] and bias[1] == 0
@@ -311,7 +356,10 @@ def _positive(
         raise ValueError(f"bounds of {name} must be two numbers that increase, got {bounds}")
     if is_positive and np.any(np.asarray(bounds[0]) < 0):
         raise ValueError(f"bounds of {name} must not be negative, got {bounds[0]}")
-    return Parameter(np.clip(nominal, *bounds), *bounds, write=write, unit=unit)
+    begin = np.clip(nominal, *bounds)  # bounds may be those of a rounded number
+    if not np.allclose(begin, nominal, rtol=1e-5, atol=1e-12):
+        raise ValueError(f"{name} of the scene must be within its bounds, {bounds}, got {nominal.tolist()}")
+    return Parameter(begin, *bounds, write=write, unit=unit)
 
 
 def inertia(scene: Scene, body: str) -> Parameter:
@@ -337,7 +385,7 @@ def inertia(scene: Scene, body: str) -> Parameter:
         index, parts = index_of(model, _Object.mjOBJ_BODY, body), body_fields(pseudo_inertia(value))
         return {name: getattr(model, name).at[index].set(part) for name, part in parts.items()}
 
-    index = index_of(scene.model, _Object.mjOBJ_BODY, body)
+    index = _indices(scene, _Object.mjOBJ_BODY, body)[0]
     names = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
     fields = [np.asarray(getattr(scene.model, name), float)[index] for name in names]
     nominal = logarithms(second_moments(*fields))

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjxgrad._arrays import instance, real
+from mjxgrad._arrays import instance, positive, real
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.tree import joint_runs
 from mjxgrad.rollouts import State, initial_state
@@ -47,37 +47,42 @@ class Recording:
     def __post_init__(self):
         for name in ("measured", "noise"):
             instance(f"{name} of {self.name}", getattr(self, name), Mapping, 'a dict by signal, such as {"qpos": ...}')
-        rows = {name: np.asarray(real(f"{name} of {self.name}", value), float) for name, value in self.measured.items()}
+        of = f"of {self.name}"
+        rows = {name: np.asarray(real(f"{name} {of}", value), float) for name, value in self.measured.items()}
+        if not all(isinstance(name, str) and 1 <= v.ndim <= 2 for name, v in rows.items()):
+            given = {name: v.shape for name, v in rows.items()}
+            raise ValueError(f"measured {of} must hold one row per time, by name, got shapes {given}")
         for name in ("controls", "times", "control_times"):
             if (value := getattr(self, name)) is None:
                 continue
-            if not (np.ndim(value) and np.isfinite(real(f"{name} of {self.name}", value)).all()):
-                raise ValueError(f"{name} of {self.name} must be finite, one row per time, got {value}")
-            if name != "controls" and (np.any(np.diff(value) <= 0) or np.min(value) < 0):
-                raise ValueError(f"{name} of {self.name} must increase from 0 or later, got {value}")
+            value = np.asarray(real(f"{name} {of}", value), float)
+            if value.ndim not in ((1, 2) if name == "controls" else (1,)) or not np.isfinite(value).all():
+                raise ValueError(f"{name} {of} must be finite, one row per time, got {value}")
+            if name != "controls" and (np.any(np.diff(value) <= 0) or np.any(value < 0)):
+                raise ValueError(f"{name} {of} must increase from 0 or later, got {value}")
         object.__setattr__(self, "measured", {k: v[:, None] if v.ndim == 1 else v for k, v in rows.items()})
         counts = {name: len(v) for name, v in rows.items()} | ({} if self.times is None else {"times": len(self.times)})
         lengths = set(counts.values())
         if not rows or 0 in lengths:
-            raise ValueError(
-                f"measured of {self.name} must hold at least one row of some signal, got {counts or 'none'}"
-            )
+            raise ValueError(f"measured {of} must hold at least one row of some signal, got {counts or 'none'}")
         if len(lengths) > 1:
-            raise ValueError(f"measured and times of {self.name} must have the same number of rows, got {counts}")
+            raise ValueError(f"measured and times {of} must have the same number of rows, got {counts}")
         if infinite := [name for name, v in rows.items() if np.isinf(v).any()]:
-            raise ValueError(
-                f"measured of {self.name} must be finite, or NaN for none, got infinity in {', '.join(infinite)}"
-            )
+            raise ValueError(f"measured {of} must be finite, or NaN for none, got infinity in {', '.join(infinite)}")
         count = len(self.controls) if self.controls is not None else None
+        if self.control_times is not None and len(self.control_times) != count:
+            given = f"{len(self.control_times)} times and {count or 'no'} rows"
+            raise ValueError(f"control_times {of} must have one time per row of controls, got {given}")
         if count is not None and self.times is None and self.control_times is None and lengths != {count + 1}:
             needed = f"{count + 1} rows for {count} controls, one at each state, or times"
-            raise ValueError(f"measured of {self.name} must have {needed}, got {max(lengths)}: NaN fills gaps")
-        instance(f"start of {self.name}", self.start, State | None, "of mg.initial_state")
+            raise ValueError(f"measured {of} must have {needed}, got {max(lengths)}: NaN fills gaps")
+        instance(f"start {of}", self.start, State | None, "of mg.initial_state")
         if unknown := set(self.noise) - set(rows):
-            raise ValueError(f"noise of {self.name} must name measured signals, got {sorted(unknown)}")
+            raise ValueError(f"noise {of} must name measured signals, got {sorted(map(str, unknown))}")
         for name, value in self.noise.items():
-            if not (np.asarray(real(f"noise of {name}", value)) > 0).all():
-                raise ValueError(f"noise of {name} of {self.name} must be positive, or inf for no weight, got {value}")
+            noise = np.asarray(real(f"noise of {name}", value))
+            if noise.ndim > 1 or not (noise > 0).all():
+                raise ValueError(f"noise of {name} {of} must be positive, or inf for no weight, got {value}")
 
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
         """Return windows of a duration (s) at the scene's time step (s), each from a measured state; the rest is dropped.
@@ -87,10 +92,12 @@ class Recording:
         rows, for joints of one number each.
 
         Raises:
-            ValueError: if positions were not measured, or no window fits.
+            ValueError: if positions were not measured, no window fits, or a number is not positive.
         """
         if "qpos" not in self.measured:
             raise ValueError(f"{self.name} must have measured qpos to be cut, got {sorted(self.measured)}")
+        positive("duration", duration)
+        positive("timestep", timestep)
         measured, noise, times = dict(self.measured), dict(self.noise), _times(self, timestep)
         begins = np.arange(times[0], times[-1] - duration + timestep / 2, duration)
         if not begins.size:
@@ -174,14 +181,17 @@ def _window(scene: Scene, recording: Recording, names: list[str], num_steps: int
         if (given := value.shape[1]) != width:
             raise ValueError(f"{name} of {recording.name} must have {width} columns in this scene, got {given}")
         columns = scene.model.nv if name == "qpos" else width
-        noise = np.broadcast_to(np.asarray(recording.noise.get(name, 1.0), float), (columns,))
+        noise = np.asarray(recording.noise.get(name, 1.0), float)
+        if noise.shape not in ((), (columns,)):
+            wanted = f"one number or {columns} in this scene"
+            raise ValueError(f"noise of {name} of {recording.name} must be {wanted}, got shape {noise.shape}")
         is_there = np.isfinite(value)
         if name == "qpos":
             value, given = np.where(is_there, value, np.asarray(scene.data.qpos)), is_there
             is_there = np.stack([given[:, one].all(axis=1) for one in coordinates(scene.model)], axis=1)
             if any(given[:, one].any() and not given[:, one].all(axis=1).any() for one in coordinates(scene.model)):
                 raise ValueError(f"qpos of {recording.name} must have all four numbers of a quaternion, or none")
-        weight[name] = np.pad(is_there / noise, (spare, (0, 0)))
+        weight[name] = np.pad(is_there / np.broadcast_to(noise, (columns,)), (spare, (0, 0)))
         measured[name] = np.pad(np.nan_to_num(value), (spare, (0, 0)), mode="edge")
     controls = _controls(scene, recording, num_steps, timestep)
     index, share = (np.pad(x, spare) for x in (index, place - index))
@@ -237,6 +247,8 @@ def _width(scene: Scene, name: str) -> int:
 def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
     """Return the state at time 0: the given one, else the first row; missing parts are the scene's pose, at rest."""
     if recording.start is not None:
+        if any(getattr(recording.start, name).shape != getattr(scene.data, name).shape for name in STATES):
+            raise ValueError(f"start of {recording.name} must be a state of this scene, of mg.initial_state")
         return recording.start
     first = {name: recording.measured[name][0] for name in STATES if name in recording.measured and times[0] == 0}
     whole = {name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}

@@ -20,7 +20,7 @@ from mjxgrad.identification.ensemble import MISFIT, Ensemble, fit
 from mjxgrad.identification.ensemble import size as ensemble_size
 from mjxgrad.identification.motions import Motions
 from mjxgrad.identification.normal import factors_of, solved, split
-from mjxgrad.identification.parameters import Parameter
+from mjxgrad.identification.parameters import Parameter, check_entries
 from mjxgrad.identification.recording import Recording, Windows, after_start, spread, stack
 from mjxgrad.identification.result import Identification, Outlook, Stopped, exceeds_noise, statistics
 from mjxgrad.rollouts import DivergedError
@@ -102,7 +102,8 @@ def identify(
         The values, their intervals, and undetermined parameters; `print(result.summary())`.
 
     Raises:
-        ValueError: if there are no parameters or recordings, nothing was measured, or shapes do not fit the scene.
+        ValueError: if there are no parameters or recordings, two parameters are of the same number, nothing was measured, or
+            shapes do not fit the scene.
         DivergedError: if the simulation diverges with the nominal values.
     """
     given = _checked(scene, parameters, recordings, delay, free_start, contact)
@@ -166,6 +167,7 @@ def _checked(
     if delay is not None and delay not in parameters:
         raise ValueError(f"delay must name one of the parameters {sorted(parameters)}, got {delay!r}")
     instance("free_start", free_start, bool | None, "True, False or None")
+    check_entries(scene, parameters)
     return _Problem(Motions(scene, parameters, delay=delay, contact=contact), recordings, free_start)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from mjxgrad._arrays import instance, positive, real, whole
+from mjxgrad._programs import is_traced
 from mjxgrad._text import write
 from mjxgrad.batched.device import fits
 from mjxgrad.scene import Scene
@@ -69,10 +70,14 @@ def frames(
     height, width = whole("height", height, None), whole("width", width, None)
     if timestep is None:
         timestep = float(scene.model.opt.timestep if isinstance(scene, Scene) else scene.opt.timestep)
+    if is_traced(qpos):
+        raise ValueError("frames must be drawn outside of jax.jit and jax.vmap: return qpos, and draw it then")
     positions = np.asarray(real("qpos", qpos), dtype=np.float64)
     _check(mj_model, positions, timestep=timestep, fps=fps, speed=speed, height=height, width=width)
     if isinstance(camera, str):
         index_of(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)  # refuses an unknown one
+    elif not isinstance(camera, mujoco.MjvCamera | None) and whole("camera", camera, -1) >= mj_model.ncam:
+        raise ValueError(f"camera must be below {mj_model.ncam}, or -1 for the free camera, got {camera}")
     mj_model = copy.copy(mj_model)
     mj_model.vis.global_.offheight = max(height, mj_model.vis.global_.offheight)
     mj_model.vis.global_.offwidth = max(width, mj_model.vis.global_.offwidth)
@@ -118,7 +123,7 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     The file appears at its place, in an existing folder, once it is complete. H.264 refuses an odd last row, so it is left out.
 
     Raises:
-        ValueError: if the video has no frames.
+        ValueError: if the video has no frames, or is neither of bytes nor of floats from 0 to 1.
         OSError: if the file cannot be written.
         RuntimeError: if ffmpeg fails, or is not installed.
     """
@@ -130,12 +135,21 @@ def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
         raise RuntimeError(f"writing a video needs {error.name}: pip install 'mjxgrad[render]'") from error
 
     instance("path", path, str | os.PathLike, "the path of a file")
-    path, video = Path(path), np.asarray(video)
+    try:
+        path, video = Path(path), np.asarray(video)
+    except ValueError:  # frames of different sizes
+        raise ValueError("video must have frames of one size, of shape (frames, height, width, 3)") from None
     positive("fps", fps)
     if path.suffix.lower() != ".mp4" or path.is_dir():
         raise ValueError(f"path must be of a file that ends in .mp4, got {path}")
     if video.ndim != 4 or not len(video) or video.shape[3] != 3:
         raise ValueError(f"video must have shape (frames, height, width, 3), got {video.shape}")
+    is_real = np.issubdtype(video.dtype, np.floating)
+    if video.dtype != np.uint8 and not (is_real and ((video >= 0) & (video <= 1)).all()):
+        given = f"{video.dtype} from {video.min():g} to {video.max():g}"
+        raise ValueError(f"video must be uint8, as mg.render.frames gives, or floats from 0 to 1, got {given}")
+    if min(video.shape[1:3]) < 2:
+        raise ValueError(f"video must have two rows and two columns at least, got shape {video.shape}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"path must be in an existing folder, got {path}")
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
