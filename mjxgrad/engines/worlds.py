@@ -20,6 +20,7 @@ from mjxgrad.engines.bridge import NUMBER, Program, Room, Values
 from mjxgrad.stepping import pairs, slope
 
 _POSITION, _VELOCITY, _INPUT = 3e-5, 1e-3, 2e-3  # widths of differences (m or rad; m/s or rad/s; the unit of an input)
+_CHANGE, _LEAST_INPUT = 3e-4, 1e-5  # m/s or rad/s that a control's difference may change, and its least width
 _CLEAR = 0.8  # of the way to a surface, which differences of positions may go
 _LEAST = 2e-6  # of their widths; rounding is 3 % of such a difference
 _AT_ONCE = 2**32  # bytes of Warp's data for the worlds of one call
@@ -97,6 +98,13 @@ class Worlds:
         names = ("J", "type", "id", "pos", "margin", *(("J_rownnz", "J_rowadr", "J_colind") if is_sparse else ()))
         rows = tuple(f"efc.{name}" for name in names)
         return Program(model, "forward", (*rows, "nefc", "contact.solimp", "qacc_smooth"), self._room)
+
+    @functools.cached_property
+    def _widths(self) -> Float[np.ndarray, " nu"]:
+        """Return widths of controls: small for a stiff servo, since dry friction and contacts let go beyond a change of speed."""
+        model = self.mj_model
+        speed = model.opt.timestep * model.actuator_acc0 * np.abs(model.actuator_gainprm[:, 0])  # by a control of 1
+        return np.clip(_CHANGE / np.maximum(speed, 1e-9), _LEAST_INPUT, _INPUT).astype(np.float32)
 
     @functools.cached_property
     def _levers(self) -> Float[np.ndarray, "nbody nv"]:
@@ -248,7 +256,8 @@ class Worlds:
         middle = np.where(limited, ends.mean(axis=1), np.inf)
         if name == "act":
             middle = np.repeat(middle, np.maximum(self.mj_model.actuator_actnum, 0))
-        return jnp.where(given[name] > middle.astype(np.float32), -_INPUT, _INPUT)
+        width = self._widths if name == "ctrl" else _INPUT
+        return jnp.where(given[name] > middle.astype(np.float32), -width, width)
 
     def _carried(self, given: Values, end: Values, change: Float[Array, " nv"], speeding: Float[Array, " nv"]) -> Array:
         """Return what becomes of positions by the velocities after the step, in tangent space."""
