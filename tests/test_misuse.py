@@ -388,7 +388,7 @@ FOUND = {
     "planning.SceneSystem(scene, num_substeps=2.5)": "num_substeps must be a whole number, got 2.5",
     "planning.GoalCost(jnp.zeros(2), jnp.ones(3), 1.0, 0.1).stage(system, jnp.zeros(2), jnp.zeros(2))":
         "stage_weight must be one number or have shape (2,), got (3,)",
-    "planning.GoalCost(jnp.zeros(2), 1.0, [1.0, -1.0], 0.1)": "terminal_weight must be at least 0, got [ 1. -1.]",
+    "planning.GoalCost(jnp.zeros(2), 1.0, [1.0, -1.0], 0.1)": "terminal_weight must be at least 0 and finite, got [ 1. -1.]",
     "mg.render.frames(scene, roll(horizon=2))": "qpos must be positions, got a trajectory: give its .qpos",
     "mg.render.write_video('v.mp4', np.zeros((2, 4)))": "video must have shape (frames, height, width, 3), got (2, 4)",
     # Functions: none, in place of a path, or of other arguments.
