@@ -106,12 +106,6 @@ def test_a_cost_of_another_form_needs_a_new_controller(controller):
     assert controller.cost is COST
 
 
-@pytest.mark.parametrize("state", [None, "now", ["a", "b"], [[1.0], [2.0, 3.0]]])
-def test_what_is_no_state_is_refused(controller, state):
-    with pytest.raises(ValueError, match="state must be a vector, or for a scene its State or C MuJoCo's data, got"):
-        controller(state)
-
-
 def test_a_start_of_whole_numbers_is_one_of_floats(controller):
     given, how = (controller.system, COST), {"smoother": Exact(), "schedule": np.ones(5), "upper": 2.0}
     starts = np.array([1, 0]), np.array([1.0, 0.0])
