@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from mjxgrad.bodies.spatial import rotation_matrix
+from experiments.problems.quadruped import in_trunk
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.scene import load_scene
@@ -65,7 +65,7 @@ class PushedHumanoid(Environment):
         return self.scene.data.qpos[7:] + _REACH * action
 
     def observe(self, state: State, memory: Memory) -> Float[Array, " obs"]:
-        down, speed, turning = _in_pelvis(state)
+        down, speed, turning = in_trunk(state)
         posture = state.qpos[7:] - self.scene.data.qpos[7:]
         parts = [down, speed, turning, state.qpos[2:3], posture, 0.1 * state.qvel[6:], memory["action"]]
         return jnp.concatenate(parts)
@@ -75,7 +75,7 @@ class PushedHumanoid(Environment):
         return jnp.concatenate([memory["push"], memory["next"], memory["wait"][None] / _EVERY])
 
     def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Memory) -> Rewards:
-        down, speed, turning = _in_pelvis(after)
+        down, speed, turning = in_trunk(after)
         return {
             "alive": jnp.full_like(speed[0], 3.0),
             "speed": -(speed**2).sum(),
@@ -89,7 +89,7 @@ class PushedHumanoid(Environment):
         }
 
     def is_over(self, state: State) -> Bool[Array, ""]:
-        return (state.qpos[2] < _LOWEST) | (-_in_pelvis(state)[0][2] < _LEAST_UP)
+        return (state.qpos[2] < _LOWEST) | (-in_trunk(state)[0][2] < _LEAST_UP)
 
 
 def pushed_humanoid(engine: EngineName = "mjx") -> PushedHumanoid:
@@ -136,9 +136,3 @@ def _push(key: PRNGKeyArray) -> Float[Array, "2"]:
     angle = jax.random.uniform(where, (), maxval=2 * np.pi)
     speed = jax.random.uniform(size, (), minval=_PUSH[0], maxval=_PUSH[1])
     return speed * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-
-
-def _in_pelvis(state: State) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-    """Return the downward direction, the velocity (m/s) and the angular velocity (rad/s) in the pelvis's axes."""
-    turn = rotation_matrix(state.qpos[None, 3:7])[0]
-    return -turn[2], turn.T @ state.qvel[:3], state.qvel[3:6]

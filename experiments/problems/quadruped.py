@@ -54,17 +54,17 @@ class Quadruped(Environment):
         return self.scene.data.qpos[7:] + _REACH * action
 
     def observe(self, state: State, memory: Memory) -> Float[Array, " 45"]:
-        down, _, turning = _in_trunk(state)
+        down, _, turning = in_trunk(state)
         posture = state.qpos[7:] - self.scene.data.qpos[7:]
         return jnp.concatenate([turning, down, memory["command"], posture, 0.1 * state.qvel[6:], memory["action"]])
 
     def privileged(self, state: State, memory: Memory) -> Float[Array, " 7"]:
         """Return speed and height, which the rewards are about, the next push, and the friction."""
         friction = self.scene.model.geom_friction[:1, 0]
-        return jnp.concatenate([_in_trunk(state)[1], state.qpos[2:3], memory["push"], friction])
+        return jnp.concatenate([in_trunk(state)[1], state.qpos[2:3], memory["push"], friction])
 
     def rewards(self, before: State, action: Float[Array, " nu"], after: State, memory: Memory) -> Rewards:
-        down, speed, turning = _in_trunk(after)
+        down, speed, turning = in_trunk(after)
         command = memory["command"]
         return {
             "speed": -((speed[:2] - command[:2]) ** 2).sum(),
@@ -80,7 +80,7 @@ class Quadruped(Environment):
         }
 
     def is_over(self, state: State) -> Bool[Array, ""]:
-        return (state.qpos[2] < _LOWEST) | (_in_trunk(state)[0][2] > -0.3)
+        return (state.qpos[2] < _LOWEST) | (in_trunk(state)[0][2] > -0.3)
 
 
 def quadruped() -> Quadruped:
@@ -109,7 +109,7 @@ def _command(key: PRNGKeyArray) -> Float[Array, "3"]:
     return jax.random.uniform(key, (3,), minval=-most, maxval=most)
 
 
-def _in_trunk(state: State) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-    """Return the downward direction, the velocity (m/s) and the angular velocity (rad/s) in the trunk's axes."""
+def in_trunk(state: State) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Return the downward direction, the velocity (m/s) and the angular velocity (rad/s) in the axes of a free trunk."""
     turn = rotation_matrix(state.qpos[None, 3:7])[0]
     return -turn[2], turn.T @ state.qvel[:3], state.qvel[3:6]

@@ -209,11 +209,11 @@ def check(
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
     price = prices["slope"] / prices["discrete"] if prices else math.inf
     advice = findings.recommend(motions, stability, measured, slots, price)
-    if prices and not device.is_cpu():
-        seconds = seconds_by_engine(scene, ENGINES, say)
-        if seconds:
-            advice = dataclasses.replace(advice, engine=min(seconds, key=lambda engine: seconds[engine][1]))
-            found.append(findings.engine_prices_finding(seconds))
+    # It compiles for minutes, which a quick check, or one that was interrupted, does not wait for.
+    is_asked = prices and measured and not measured.was_interrupted and not device.is_cpu()
+    if is_asked and (seconds := seconds_by_engine(scene, ENGINES, say)):
+        advice = dataclasses.replace(advice, engine=min(seconds, key=lambda engine: seconds[engine][1]))
+        found.append(findings.engine_prices_finding(seconds))
     told = slopes(measured.lines) if measured else ()
     if prices:
         prices = {kind: advice.horizon * seconds for kind, seconds in prices.items()}

@@ -162,15 +162,17 @@ def seconds_by_engine(
         return jax.jit(jax.vmap(jax.grad(ends)))
 
     for engine in engines:
-        say(
-            f"measuring {NUM_COMPARED} gradients by {engine}, which may compile for a minute or more; Ctrl-C leaves it out"
-        )
-        with contextlib.suppress(SceneError, KeyboardInterrupt):
+        say(f"measuring {NUM_COMPARED} gradients by {engine}, which may compile for a minute or more; Ctrl-C ends it")
+        try:
             compute, began = gradients(scene.with_engine(engine)), time.perf_counter()
             patiently(lambda compute=compute: jax.block_until_ready(compute(controls)))
             first, again = time.perf_counter() - began, time.perf_counter()
             patiently(lambda compute=compute: jax.block_until_ready(compute(controls + 0)))
             found[engine] = first, time.perf_counter() - again
+        except SceneError:  # it does not step this scene
+            continue
+        except KeyboardInterrupt:
+            break
     return found
 
 
@@ -182,6 +184,7 @@ class Measured:
     lines: tuple[Line, ...]
     noises: tuple[Noise, ...]
     left_out: tuple[str, ...] = ()
+    was_interrupted: bool = False
 
 
 def measure(
@@ -238,7 +241,8 @@ def measure(
             log("interrupted: the verdict is of what was measured")
             left_out.append(words)
             end = 0.0
-    return Measured(np.array(lengths) * motions.timestep, tuple(lines), tuple(noises), tuple(left_out))
+    times = np.array(lengths) * motions.timestep
+    return Measured(times, tuple(lines), tuple(noises), tuple(left_out), was_interrupted=end == 0.0)
 
 
 def _lengths(

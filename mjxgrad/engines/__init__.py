@@ -26,8 +26,8 @@ def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
     if isinstance(contact, engine.contacts) and is_able:
         return engine
     if scene.unsupported:
-        alone = (
-            "" if isinstance(contact, engine.contacts) else f"contact=mg.{type(contact).__name__}(...) is MJX's alone: "
+        alone = f"contact=mg.{type(contact).__name__}(...) is MJX's alone: " * (
+            not isinstance(contact, engine.contacts)
         )
         raise SceneError(alone + scene.unsupported)
     return ENGINES["mjx"]

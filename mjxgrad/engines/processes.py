@@ -136,9 +136,8 @@ def serve() -> None:
 
     asked, told = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what is printed is no answer
-    mujoco.set_mju_user_warning(
-        lambda _: None
-    )  # which would write to the terminal and to a file, where numbers are NaN
+    # Where numbers are NaN, MuJoCo would write to the terminal and to a file.
+    mujoco.set_mju_user_warning(lambda _: None)
     pools: dict[int, Pool] = {}
     while True:
         try:

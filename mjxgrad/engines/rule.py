@@ -219,14 +219,11 @@ def _callback(function, shapes: dict, *arguments) -> dict[str, Array]:
             found = {name: np.full((*batch, *shape.shape), np.nan) for name, shape in shapes.items()}
         return {k: _halves(np.asarray(x, shapes[k].dtype)) for k, x in found.items()}
 
-    wanted = {k: jax.ShapeDtypeStruct(*_form_of_halves(x)) for k, x in shapes.items()}
-    given = jax.tree.map(
-        lambda x: jax.lax.bitcast_convert_type(x, np.uint32) if x.dtype.itemsize == 8 else x, arguments
-    )
-    found = jax.pure_callback(run, wanted, *given, vmap_method="expand_dims")
-    return {
-        k: jax.lax.bitcast_convert_type(x, shapes[k].dtype) if x.dtype == np.uint32 else x for k, x in found.items()
-    }
+    cut = lambda x: jax.lax.bitcast_convert_type(x, np.uint32) if x.dtype.itemsize == 8 else x  # noqa: E731
+    wanted = jax.eval_shape(lambda: {k: cut(jnp.zeros(x.shape, x.dtype)) for k, x in shapes.items()})
+    found = jax.pure_callback(run, wanted, *jax.tree.map(cut, arguments), vmap_method="expand_dims")
+    is_whole = {k: x.dtype == shapes[k].dtype for k, x in found.items()}
+    return {k: x if is_whole[k] else jax.lax.bitcast_convert_type(x, shapes[k].dtype) for k, x in found.items()}
 
 
 # Double precision crosses a callback in halves: `jax.enable_x64` as a context holds for one thread, and in XLA's others JAX would
@@ -237,10 +234,6 @@ def _whole(value: np.ndarray, dtype: np.dtype) -> np.ndarray:
 
 def _halves(value: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(value)[..., None].view(np.uint32) if value.dtype.itemsize == 8 else value
-
-
-def _form_of_halves(shape: jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], Any]:
-    return ((*shape.shape, 2), np.uint32) if shape.dtype.itemsize == 8 else (shape.shape, shape.dtype)
 
 
 def to_coordinates(scene: Scene, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:

@@ -221,14 +221,15 @@ class Worlds:
             after, before = parts.pop(0), parts.pop(0) if name == "qpos" else middle
             before = {k: jnp.broadcast_to(x, after[k].shape) for k, x in before.items()}
             width = self._apart(name, high, jnp.broadcast_to(low, high.shape))[:, None]
-            turned = jax.vmap(self._to_tangent)(before["qpos"], after["qpos"] - before["qpos"]) / width
-            changed, *others = ((after[k] - before[k]) / width for k in ("qvel", "act", "sensordata"))
-            if self.mj_model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+            moved, *others = ((after[k] - before[k]) / width for k in ("qpos", "qvel", "act", "sensordata"))
+            if self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+                turned = jax.vmap(self._to_tangent)(before["qpos"], moved)
+            else:
                 # Known from the velocities; a small input moves positions by little more than their rounding.
-                own = jnp.eye(*changed.shape, dtype=jnp.float32) if name == "qpos" else jnp.zeros_like(changed)
-                end = given | {k: middle[k][0] for k in ("qpos", "qvel")}
-                turned = jax.vmap(functools.partial(self._carried, given, end))(own, changed)
-            columns.append(jnp.concatenate([turned, changed, *others], axis=1))
+                own = jnp.eye(*others[0].shape, dtype=jnp.float32) if name == "qpos" else jnp.zeros_like(others[0])
+                end = (middle[k][0] for k in ("qpos", "qvel"))
+                turned = jax.vmap(functools.partial(self._carried, given, *end))(own, others[0])
+            columns.append(jnp.concatenate([turned, *others], axis=1))
         return jnp.concatenate(columns).T.astype(dtype)
 
     def _reach(self, given: Values) -> Float[Array, "2 #nv"]:
@@ -259,12 +260,14 @@ class Worlds:
         width = self._widths if name == "ctrl" else _INPUT
         return jnp.where(given[name] > middle.astype(np.float32), -width, width)
 
-    def _carried(self, given: Values, end: Values, change: Float[Array, " nv"], speeding: Float[Array, " nv"]) -> Array:
+    def _carried(
+        self, given: Values, after: Array, speed: Array, change: Array, speeding: Array
+    ) -> Float[Array, " nv"]:
         """Return what becomes of positions by the velocities after the step, in tangent space."""
         timestep = given.get(NUMBER + "opt.timestep", jnp.asarray(self.mj_model.opt.timestep, jnp.float32))
         tangents = self._from_tangent(given["qpos"], change), speeding
         move = lambda qpos, qvel: integrate_position(self.mj_model, qpos, qvel, timestep)  # noqa: E731
-        return self._to_tangent(end["qpos"], jax.jvp(move, (given["qpos"], end["qvel"]), tangents)[1])
+        return self._to_tangent(after, jax.jvp(move, (given["qpos"], speed), tangents)[1])
 
     def _moved(self, given: Values, name: str, changes: Float[Array, "columns size"]) -> Array:
         if name != "qpos":

@@ -211,3 +211,5 @@ def test_check_tells_on_a_gpu_what_each_engine_takes(monkeypatch):
     # C MuJoCo is faster on a processor, and MJX refuses the scene.
     assert verdict.recommendation.engine == "mujoco"
     assert "engine='mujoco'" in verdict.code
+    # Compilation is not for a quick check.
+    assert not any(one.kind == "engine_prices" for one in mg.check(TETRAHEDRON, derivatives=False).findings)
