@@ -1,5 +1,6 @@
 """Rollouts: what is kept, what is flagged, what is refused."""
 
+import dataclasses
 import warnings
 
 import jax
@@ -167,3 +168,23 @@ def test_a_pose_of_the_file_that_is_no_start_is_said_and_its_key_frames_are_take
     for asked, said in (("hom", r"one of \['home', 1\] in this scene, got 'hom'"), (2, "got 2")):
         with pytest.raises(ValueError, match=said):
             mg.initial_state(scene, keyframe=asked)
+
+
+def test_a_start_of_fewer_digits_moves_in_the_scenes_precision():
+    by_c = mg.load_scene(PUSHED, engine="mujoco")
+    start = mg.initial_state(by_c, qpos=np.array([1.0, 0.0]), qvel=np.array([0.0, 2.0]))
+    for kind in (jnp.float16, jnp.float32):
+        given = dataclasses.replace(start, qpos=start.qpos.astype(kind), qvel=start.qvel.astype(kind))
+        found = mg.rollout(by_c, given, horizon=STEPS)
+        np.testing.assert_allclose(found.qpos[-1], [1.0, H * 2 * STEPS], rtol=1e-14)  # three steps' rounding
+        assert found.qpos.dtype == start.qpos.dtype
+
+
+def test_no_double_precision_crosses_a_callback_whole():
+    """XLA calls back in threads of its own, which do not see `jax.enable_x64` as a context: JAX would round there."""
+    by_c = mg.load_scene(PUSHED, engine="mujoco")
+    slope = jax.grad(lambda u: mg.rollout(by_c, mg.initial_state(by_c), u).qpos[-1, 0])
+    lines = jax.jit(slope).lower(jnp.zeros((2, 1))).as_text().splitlines()
+    called = [line for line in lines if "callback" in line]
+    assert called
+    assert not any("xf64>" in line or "xi64>" in line for line in called)
