@@ -94,13 +94,13 @@ def geom_name(model: mjx.Model | mujoco.MjModel, geom: int) -> str:
     return mjx.id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{of_body}[{geom - int(model.body_geomadr[body])}]"
 
 
-def contact_pairs(model: mjx.Model | mujoco.MjModel) -> Pairs:
-    """List the pairs of geoms that MJX tests for contact, in no particular order; none if contacts are disabled."""
+def contact_pairs(model: mjx.Model | mujoco.MjModel, most: int | None = None) -> Pairs:
+    """List the pairs of geoms that MJX tests for contact, so many at most; none if contacts are disabled."""
     # Only the static structure of the model is read.
     if int(model.opt.disableflags) & _DISABLES_CONTACT:
         return ()
     pairs = []
-    for geom1, geom2, explicit in (map(int, pair) for pair in geom_pairs(model)):
+    for geom1, geom2, explicit in (map(int, pair) for pair in itertools.islice(geom_pairs(model), most)):
         names = (geom_name(model, geom1), geom_name(model, geom2))
         dims = [model.geom_condim[geom] for geom in _of_most_priority(model, geom1, geom2)]
         condim = model.pair_dim[explicit] if explicit >= 0 else max(dims)

@@ -36,6 +36,7 @@ class Evidence(eqx.Module):
         squared_bias_error: its standard error where there is no bias.
         noise_dim: number of coordinates that its noise is worth, $(\mathrm{tr}\,\Sigma)^2/\mathrm{tr}\,\Sigma^2$.
         squared_bias_bound: bound on it by what derivatives miss.
+        squared_jump_bound: the part of this bound that the scatter of derivatives does not explain.
         zeroth_noise: noise of the mean of the unbiased terms that the mean derivative does not share.
         first_noise: noise of the mean derivative that the other does not share.
         num_estimates: number of estimates over which noise averages and bias does not, 1 without a memory.
@@ -55,6 +56,7 @@ class Evidence(eqx.Module):
     squared_bias_error: Float[Array, "*batch"]
     noise_dim: Float[Array, "*batch"]
     squared_bias_bound: Float[Array, "*batch"]
+    squared_jump_bound: Float[Array, "*batch"]
     zeroth_noise: Float[Array, "*batch"]
     first_noise: Float[Array, "*batch"]
     num_estimates: Float[Array, "*batch"]
@@ -72,6 +74,7 @@ class Evidence(eqx.Module):
             squared_bias_error=jnp.sqrt(2.0) * memory.noise_square,
             noise_dim=noise_dim(memory.noise, memory.noise_square),
             squared_bias_bound=memory.bound,
+            squared_jump_bound=memory.jump_bound,
             zeroth_noise=memory.zeroth_width**2,
             num_estimates=1 / memory.concentration,
         )
@@ -85,6 +88,7 @@ class Memory(eqx.Module):
     noise: Scalar  # its noise, the trace of its covariance matrix Σ
     noise_square: Scalar  # the norm of Σ, √tr Σ², at most: the sum of those of the estimates
     bound: Scalar  # mean bound on the squared bias
+    jump_bound: Scalar  # mean part of it that scatter does not explain
     # Mean root of the noise of zeroth order. A step's own would give zeroth order less weight just where a rare sample shows
     # what derivatives miss.
     zeroth_width: Scalar
@@ -96,7 +100,8 @@ class Memory(eqx.Module):
         """Return the memory of one estimate."""
         noise, one = evidence.difference_variance / evidence.count, jnp.ones_like(evidence.count)
         square = evidence.squared_bias_error / jnp.sqrt(2.0)
-        return cls(difference, noise, square, evidence.squared_bias_bound, jnp.sqrt(evidence.zeroth_noise), one, one)
+        bounds = evidence.squared_bias_bound, evidence.squared_jump_bound
+        return cls(difference, noise, square, *bounds, jnp.sqrt(evidence.zeroth_noise), one, one)
 
     def with_more(self, new: "Memory") -> "Memory":
         """Return the memory with that of a new estimate, which is left out where a number of it is not finite."""
@@ -107,6 +112,7 @@ class Memory(eqx.Module):
             (1 - share) ** 2 * self.noise + share**2 * new.noise,
             (1 - share) ** 2 * self.noise_square + share**2 * new.noise_square,
             self.bound + share * (new.bound - self.bound),
+            self.jump_bound + share * (new.jump_bound - self.jump_bound),
             self.zeroth_width + share * (new.zeroth_width - self.zeroth_width),
             weight,
             (1 - share) ** 2 * self.concentration + share**2,

@@ -1,6 +1,7 @@
 """Measured motions of a scene, and their batch."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +14,8 @@ from mjxgrad._arrays import instance, positive, real
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.tree import joint_runs
 from mjxgrad.rollouts import State, initial_state
-from mjxgrad.scene import Scene, sensor
+from mjxgrad.rollouts.rollout import clamped
+from mjxgrad.scene import Scene, SceneWarning, sensor
 
 STATES = ("qpos", "qvel", "act")
 _AROUND = 2  # rows on each side that tell a speed
@@ -264,6 +266,8 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
     controls = np.asarray(recording.controls, float)
     if controls.ndim != 2 or controls.shape[1] != scene.model.nu:
         raise ValueError(f"controls of {name} must have {scene.model.nu} columns in this scene, got {controls.shape}")
+    for text in clamped(scene, controls):
+        warnings.warn(f"{scene.name}: in {name}, {text}", SceneWarning, stacklevel=4)
     if recording.control_times is not None:
         at = timestep * np.arange(num_steps)
         return np.column_stack([np.interp(at, recording.control_times, column) for column in controls.T])

@@ -100,8 +100,13 @@ class GradientStep(Descent):
                 "objective must be a function from a scale to an objective when annealing is given, got an objective; "
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
-        elif (scale := known(real("the scale of annealing", self.annealing(0)))) is not None and not np.isfinite(scale):
-            raise ValueError(f"the scale of annealing must be finite, got {scale} at first")
+        else:
+            real("the scale of annealing", self.annealing(0))
+            steps = jnp.arange(self.options.num_steps)
+            scales = known(jax.vmap(lambda step: jnp.asarray(self.annealing(step), float))(steps))
+            if scales is not None and not np.isfinite(scales).all():
+                step = int(np.argmin(np.isfinite(scales)))
+                raise ValueError(f"the scale of annealing must be finite, got {scales[step]} in step {step}")
         function("estimator", self.estimator, "objective", "params", "key", is_needed=True)
         instance(
             "optimiser", self.optimiser, optax.GradientTransformation, "of optax with its settings, as optax.adam(1e-2)"

@@ -96,7 +96,7 @@ def rollout(
     base = jnp.broadcast_to(scene.data.ctrl, (horizon, scene.model.nu)) if sequence is None else sequence
     rows = Rows(base, jnp.zeros_like(base) if noise is None else jnp.asarray(noise), forces)
     motion = Motion(scene, policy, params if policy is not None else None, observe, policy_sees, checkpoint, contact)
-    for message in () if sequence is None else _clamped(scene, sequence):
+    for message in () if sequence is None else clamped(scene, sequence):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     with traceable("the policy, or observe,"):
         found = engine.roll_out(motion, state, rows)
@@ -160,7 +160,7 @@ def linearise(
     return Linearisation(*engine_of(scene, contact).linearise(scene, state, ctrl, contact))
 
 
-def _clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str]:
+def clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str]:
     """Yield that controls leave their actuator's range, if they are known and do."""
     model, numbers, ends = scene.mj_model, known(controls), known(scene.model.actuator_ctrlrange)
     if numbers is None or ends is None or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:

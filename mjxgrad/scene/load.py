@@ -23,12 +23,19 @@ from mjxgrad.contact.collision import slot_dims
 from mjxgrad.contact.parameters import contact_pairs
 from mjxgrad.scene import conversions as rules
 from mjxgrad.scene.refusals import REFUSALS, UNDECIDED, UNLIKE, refusal_messages
-from mjxgrad.scene.scene import OF_FILES, Scene, SceneError, SceneWarning, check_engine, numbers_of, takes_warp
+from mjxgrad.scene.scene import (
+    MOST_PAIRS,
+    OF_FILES,
+    Scene,
+    SceneError,
+    SceneWarning,
+    check_engine,
+    numbers_of,
+    takes_warp,
+)
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
-MOST_PAIRS = 20_000
-"""Largest number of geom pairs; loading more takes minutes and is refused."""
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -87,7 +94,7 @@ def load_scene(
     if not keep_everything and not unsupported:
         omissions = rules.switch_off(stepped)
         conversions += _fit_solver(stepped)
-    pairs = contact_pairs(stepped) if not unsupported or count_pairs(mj_model) > MOST_PAIRS else contact_pairs(mj_model)
+    pairs = contact_pairs(mj_model if unsupported else stepped, MOST_PAIRS)
     with jax.ensure_compile_time_eval():  # also within a traced function that loads its own scene
         model, data = _put(stepped, name, max_contacts)
     if unsupported:

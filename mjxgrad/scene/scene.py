@@ -30,6 +30,8 @@ from mjxgrad.scene.refusals import PARALLEL, UNDECIDED, UNLIKE, has_medium, refu
 from mjxgrad.stepping import EngineName
 from mjxgrad.stepping.rows import index_of
 
+MOST_PAIRS = 20_000
+"""Largest number of geom pairs that MJX loads, since more take minutes, and that a scene lists."""
 _WIDTH = 118  # characters in a laptop's terminal
 _OPTIONS = ("timestep", "gravity", "wind")
 _NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pair_friction", "dof_armature", "timestep"}
@@ -59,7 +61,7 @@ class Scene(eqx.Module):
         mj_model: the C model of the same motion, for rendering and names, with the file's numbers; see `to_mujoco`.
         omissions: parts that a step leaves out, and why.
         conversions: settings replaced by others, and why.
-        pairs: all geom pairs that can touch, in the order of `contact_parameters`; `summary` groups equal ones.
+        pairs: geom pairs that can touch, the first 20,000, in the order of `contact_parameters`; `summary` groups equal ones.
         name: source of the scene.
         unsupported: reason why MJX cannot step it, so that C MuJoCo does; empty if MJX can.
         chosen: the engine that `with_engine` chose; None for the default.
@@ -353,7 +355,7 @@ def _contacts(scene: Scene) -> str:
         groups.setdefault(cells, []).append(pair)
     rows = [(name_pairs(pairs), *cells) for cells, pairs in groups.items()]
     count = len(scene.pairs)
-    title = f"Contact: {count} pair{'s' * (count > 1)} of geoms can touch"
+    title = f"Contact: {'at least ' * (count == MOST_PAIRS)}{count} pair{'s' * (count > 1)} of geoms can touch"
     if not scene.unsupported:
         slots, every = scene.data._impl.ncon, sum(map(len, candidates(scene.model).values()))
         title += f"; room for {slots} contacts of {every}" if slots < every else f", at {every} points"

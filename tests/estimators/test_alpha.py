@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.tree_util import Partial
 from scipy.stats import norm
 
 from mjxgrad import estimators
 from mjxgrad.estimators import Diagnosis, Reason, rules
 from mjxgrad.objective import parameter_noise
+from mjxgrad.objective.base import Differentiated, ParameterNoise
 from tests.estimators import textbook
 from tests.estimators.test_control_variate import assert_unbiased_with_right_errors
 from tests.estimators.textbook import POINT, STDDEVS, repeat
@@ -125,7 +127,14 @@ def test_a_memory_is_the_weighted_mean_of_its_estimates(key):
     for one in found[1:]:
         memory = memory.with_more(one)
     weights = 0.98 ** np.arange(4, -1, -1.0) / (0.98 ** np.arange(5)).sum()
-    for name, power in (("difference", 1), ("bound", 1), ("zeroth_width", 1), ("noise", 2), ("noise_square", 2)):
+    for name, power in (
+        ("difference", 1),
+        ("bound", 1),
+        ("jump_bound", 1),
+        ("zeroth_width", 1),
+        ("noise", 2),
+        ("noise_square", 2),
+    ):
         expected = sum(w**power * np.asarray(getattr(one, name)) for w, one in zip(weights, found, strict=True))
         np.testing.assert_allclose(getattr(memory, name), expected, rtol=1e-9, err_msg=name)
     np.testing.assert_allclose(1 / memory.concentration, 1 / (weights**2).sum(), rtol=1e-9)
@@ -159,6 +168,39 @@ def test_the_bound_on_the_bias_holds_for_a_small_jump_in_many_dimensions(key):
     assert bias * estimate.alpha < estimate.bias_bound
     # The standard deviation of a jump that half of the samples take is half of it.
     np.testing.assert_allclose(estimate.bias_bound, estimate.alpha * 0.5 * 0.05 / 0.1, rtol=0.2)
+
+
+def test_scatter_explains_what_derivatives_miss_of_teeth_and_nothing_of_a_jump(key):
+    """Both bound the bias alike; by the right derivatives of teeth, and of a quartic, nothing speaks for a jump."""
+    jump = lambda x: x[0] + 0.04 * jnp.where(x[0] >= 0, 1.0, 0.0)  # noqa: E731
+    for function, share in ((scattered, 0), (lambda x: (x**4).sum(), 0), (jump, 1)):
+        objective = parameter_noise(function, 0.1, dim=30)
+        known = alpha_order(objective, jnp.zeros(30), key, num_samples=64).memory
+        assert known.bound > 0
+        np.testing.assert_allclose(known.jump_bound, share * known.bound, rtol=1e-6)
+
+
+class Shifted(ParameterNoise):
+    """Noise on forty numbers, which the only parameter shifts alike."""
+
+    def sample_noise(self, key):
+        return self.stddev * jax.random.normal(key, (40,))
+
+    def differentiate(self, params, noise):
+        cost, slopes = jax.value_and_grad(self.function)(params[0] + noise)
+        score, stddev = noise / self.stddev**2, jnp.broadcast_to(self.stddev, (40,))
+        return Differentiated(cost, slopes, score, stddev, Partial(lambda x: x.sum()[None]))
+
+
+def test_of_one_number_first_order_counts_where_scatter_alone_is_unexplained(key):
+    """Derivatives by the noise scatter, and not along the shift: that of the parameter is exact, and zeroth order is far off."""
+    objective = Shifted(lambda at: at.sum() + 0.3 * jnp.sin((at - at.mean()) / 0.02).sum(), jnp.array(0.1), 1)
+    first, unbiased, mixed = (
+        error_of(repeat(f, objective, jnp.zeros(1), 1000, seed=1, num_samples=16), 40.0)[0]
+        for f in (estimators.first_order, estimators.control_variate, estimators.alpha_order)
+    )
+    assert first < 1e-6 * unbiased
+    assert mixed < 0.1 * unbiased  # a third if nothing is taken off
 
 
 def test_a_large_constant_changes_nothing_in_single_precision(key):

@@ -27,11 +27,13 @@ def evidence(**changes) -> Evidence:
         "squared_bias_error": 0.05,
         "noise_dim": 1e12,
         "squared_bias_bound": 9.0,
+        "squared_jump_bound": 9.0,
         "zeroth_noise": 4 / 50,
         "first_noise": 1 / 50,
         "num_estimates": 1.0,
     } | changes
-    return Evidence(**{name: jnp.asarray(value) for name, value in facts.items()})
+    shape = np.broadcast_shapes(*map(np.shape, facts.values()))
+    return Evidence(**{name: jnp.broadcast_to(jnp.asarray(value), shape) for name, value in facts.items()})
 
 
 RADIUS = 2.0095752 * np.sqrt(4 / 50)
@@ -68,6 +70,28 @@ def assert_decides(rule, facts: Evidence, alpha: float, reason, bias_bound: floa
             Reason.bias_limit,
             0.5 * 0.06**0.5,
         ),
+        # What noise exceeds with the probability of 2√(V/V⁰), here 1/5, is no bias; V is at least J/n and V⁰/100.
+        *[
+            (
+                rules.LeastRisk(),
+                {
+                    "first_noise": noise,
+                    "squared_jump_bound": jumps,
+                    "squared_bias": 0.03 + 0.05 * far,
+                    "noise_dim": dim,
+                },
+                0.08 / (0.11 + noise),
+                Reason.bias_limit,
+                0.08 / (0.11 + noise) * 3.0,
+            )
+            for noise, jumps, dim, far in [
+                (8e-4, 0.0, np.inf, np.sqrt(2 * np.log(5))),
+                (0.0, 0.04, np.inf, np.sqrt(2 * np.log(5))),
+                (0.0, 0.0, np.inf, np.sqrt(2 * np.log(5))),
+                (0.0, 0.04, 1.0, np.sqrt(2 * np.log(5)) + np.sqrt(2) * np.log(5)),
+                (0.0, 1.0, 1.0, 0.0),
+            ]
+        ],
         # Without noise and bias there is nothing to weigh.
         (rules.LeastRisk(), {"zeroth_noise": 0.0, "first_noise": 0.0}, 1.0, Reason.inverse_variance, 3.0),
         # Student's 0.975 quantile of 49 degrees, times the error of the zeroth order: the ball's radius.
