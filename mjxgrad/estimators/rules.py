@@ -169,8 +169,8 @@ class LeastRisk(eqx.Module):
       zeroth order.
 
     Derivatives that scatter about the right mean leave much unexplained, but no more than they scatter; derivatives that miss
-    jumps do. $V$ is at least $J/n$, with $J$ the part of $U$ that scatter does not explain, and so jumps show at once. For the
-    price of a mistake it is also at least $V^0/100$.
+    jumps do. With $J$ the part of $U$ that scatter does not explain, $pJ/n$ is the part of $V^0$ that is due to jumps. $V$ is at
+    least that, and so jumps show at once. For the price of a mistake it is also at least $V^0/100$.
 
     In a descent (see `Memory`) $D$ is that of the mean over its last steps, and $b^2$ counts as many times as there are steps
     over which noise averages.
@@ -196,7 +196,8 @@ class LeastRisk(eqx.Module):
 
 def _taken_off(evidence: Evidence) -> Float[Array, "*batch"]:
     """Return how many of its standard errors the squared difference must exceed its noise by, to count as bias."""
-    zeroth, jumps = evidence.zeroth_noise, evidence.squared_jump_bound / jnp.maximum(evidence.count, 1)
+    zeroth = evidence.zeroth_noise
+    jumps = evidence.noise_dim * evidence.squared_jump_bound / jnp.maximum(evidence.count, 1)
     first = jnp.maximum(jnp.maximum(evidence.first_noise, jumps), _LEAST_NOISE * zeroth)
     # Noise worth p coordinates exceeds so many errors with the probability exp(-rate) at most.
     rate = jnp.maximum(jnp.log(zeroth / (4 * jnp.where(first > 0, first, 1))) / 2, 0)

@@ -70,25 +70,25 @@ def assert_decides(rule, facts: Evidence, alpha: float, reason, bias_bound: floa
             Reason.bias_limit,
             0.5 * 0.06**0.5,
         ),
-        # What noise exceeds with the probability of 2√(V/V⁰), here 1/5, is no bias; V is at least J/n and V⁰/100.
+        # What noise of p coordinates exceeds with the probability of 2√(V/V⁰), here 1/5 or 1, is no bias: so many errors.
+        # V is at least pJ/n and V⁰/100.
         *[
             (
                 rules.LeastRisk(),
                 {
                     "first_noise": noise,
                     "squared_jump_bound": jumps,
-                    "squared_bias": 0.03 + 0.05 * far,
+                    "squared_bias": 0.03 + 0.05 * errors,
                     "noise_dim": dim,
                 },
                 0.08 / (0.11 + noise),
                 Reason.bias_limit,
                 0.08 / (0.11 + noise) * 3.0,
             )
-            for noise, jumps, dim, far in [
-                (8e-4, 0.0, np.inf, np.sqrt(2 * np.log(5))),
-                (0.0, 0.04, np.inf, np.sqrt(2 * np.log(5))),
-                (0.0, 0.0, np.inf, np.sqrt(2 * np.log(5))),
-                (0.0, 0.04, 1.0, np.sqrt(2 * np.log(5)) + np.sqrt(2) * np.log(5)),
+            for noise, jumps, dim, errors in [
+                (8e-4, 0.0, 4.0, np.sqrt(2 * np.log(5)) + np.log(5) / np.sqrt(2)),
+                (0.0, 0.01, 4.0, np.sqrt(2 * np.log(5)) + np.log(5) / np.sqrt(2)),
+                (0.0, 0.0, 1.0, np.sqrt(2 * np.log(5)) + np.log(5) * np.sqrt(2)),
                 (0.0, 1.0, 1.0, 0.0),
             ]
         ],
