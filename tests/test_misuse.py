@@ -22,6 +22,8 @@ noisy = mg.parameter_noise(lambda x: x @ x, 0.1)
 scene = mg.load_scene("<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody>"
                       "<actuator><motor joint='joint'/></actuator></mujoco>".replace("<joint ", "<joint name='joint' "))
 state = mg.initial_state(scene)
+bounded = mg.load_scene("<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='.1'/></body></worldbody>"
+                        "<actuator><motor name='motor' joint='j' ctrlrange='-1 1'/></actuator></mujoco>")
 balls = mg.load_scene("<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/><geom name='lamp' size='.1' contype='0' "
                       "conaffinity='0'/><body><freejoint name='root'/><geom name='ball' size='.1'/></body><body pos='1 0 1'>"
                       "<freejoint/><geom name='other' size='.1'/></body></worldbody></mujoco>")
@@ -470,6 +472,8 @@ FOUND = {
     # Units: degrees for radians, milliseconds for seconds.
     "warned(mg.initial_state, hinged, qpos=[45.0])": "h begins at 45 rad, beyond its range from -1.5708 to 1.5708 rad",
     "warned(mg.load_scene, scene.mj_model, timestep=2)": "a time step of 2 s is long: give seconds",
+    "warned(mg.load_scene, scene.mj_model, timestep=1e-9)": "a time step of 1e-09 s is short: a second of motion takes 1e+09",
+    "warned(stack, bounded, [fit.Recording({'qpos': five}, 3 * np.ones((4, 1)))])": "in the recording, a control of actuator",
     # One thing in the place of another, and wrong orders.
     "mg.rollout(state, scene, u)": "scene must be of mg.load_scene, got State",
     "mg.rollout(scene, state.qpos, u)": "state must be of mg.initial_state, or the end of a rollout, got",

@@ -186,7 +186,8 @@ def check(
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = outcomes_of(scene, outcome, rng)
     is_any_sound = (motions.bad_steps < 0).any()
-    if cost is not None and is_any_sound:
+    if outcome is not None and is_any_sound:
+        found += findings.index_findings(scene, motions, outcome)
         found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
     # Prices come first: after Ctrl-C there is nothing left to measure.
     measured, asked = None, time.perf_counter()

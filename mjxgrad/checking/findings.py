@@ -2,8 +2,9 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,15 @@ from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import NUM_COMPARED, STDDEVS, STEPS_COMPARED, Measured, Slope, nearest, slopes
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
-from mjxgrad.engines import ENGINES
+from mjxgrad.engines import ENGINES, QUICK, Trajectory
 from mjxgrad.engines.state import LARGEST_GROWTH
 from mjxgrad.rollouts import rollout
+from mjxgrad.rollouts.start import pose_warnings
 from mjxgrad.scene import Scene, SceneError, load_scene
 from mjxgrad.stepping import EngineName
 
 _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the largest speed, 1 at least (m/s, rad/s)
+_NUM_INDEXED = 3  # steps of a trajectory whose indices are tried
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
 _DEGREES = 10.0  # least share of a control range and its joint's that tells of degrees, which are 57 times rad
@@ -80,7 +83,12 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     if bad:
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
         text = f"From {bad[0]} the motion is not finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
-        yield Finding("not_finite", text, True)
+        is_none = ~np.isfinite(motions.qpos[np.argmax(motions.bad_steps >= 0), 0]).all()
+        yield Finding(
+            "not_finite", f"{bad[0][:1].upper()}{bad[0][1:]} must hold numbers, got NaN." if is_none else text, True
+        )
+    elif warned := next(pose_warnings(scene.model, scene.mj_model, motions.qpos[0, 0]), ""):
+        yield Finding("start", f"In {motions.poses[0]} {warned}.", True)
     if degrees := _in_degrees(scene.mj_model):
         text = f"In degrees? The control range of {', '.join(degrees)} is over ten times that of its joint in rad"
         yield Finding(
@@ -152,6 +160,17 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
     remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero." * is_useless
     text = f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}"
     return Finding("cost", text, is_useless)
+
+
+def index_findings(scene: Scene, motions: Motions, cost: Callable[[Trajectory], Any]) -> Iterator[Finding]:
+    """Yield what NumPy says of a cost that indexes beyond the trajectory's arrays, where JAX takes the last number."""
+    found = rollout(scene.with_engine(QUICK), motions.state(0, 0), motions.controls[0, :_NUM_INDEXED])
+    try:
+        cost(jax.tree.map(np.asarray, found))
+    except Exception as error:  # any other: the cost needs arrays of JAX
+        for one in (error, error.__cause__):
+            if isinstance(one, IndexError):
+                yield Finding("index", f"The cost looks beyond an array, where JAX takes its last number: {one}.", True)
 
 
 def engine_finding(scene: Scene, motions: Motions) -> Finding:
@@ -371,6 +390,8 @@ def headline(
     words = {
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
+        "start": "the start is a bad one",
+        "index": "the cost looks beyond an array",
         "cost": "the cost has no derivative",
         "engines": "MJX moves it otherwise",
         "no_contact": "nothing touches",

@@ -141,7 +141,7 @@ def _read(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
     """Return the columns of a file by name; those that are not known may be of text, and are of NaN."""
     is_npz = path.suffix == ".npz"
     try:
-        found = _read_npz(path) if is_npz else _read_csv(path, known)
+        found = (_read_npz if is_npz else _read_csv)(path, known)
     except (ValueError, TypeError, AttributeError, EOFError, csv.Error, zipfile.BadZipFile) as error:
         form = (
             "an NPZ with arrays of numbers"
@@ -154,11 +154,14 @@ def _read(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
     return found
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
+def _read_npz(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no archive of arrays")
     with np.load(path) as arrays:
-        wholes = {name: np.asarray(real(name, arrays[name]), float) for name in arrays}
+        wholes = {name: arrays[name] for name in arrays}
+    for name, value in wholes.items():
+        is_text = value.dtype.kind in "US" and name not in known
+        wholes[name] = np.full(value.shape, np.nan) if is_text else np.asarray(real(name, value), float)
     wholes = {name: value.reshape(len(value), -1) for name, value in wholes.items() if value.ndim}
     return {f"{n}[{i}]" if v.shape[1] > 1 else n: v[:, i] for n, v in wholes.items() for i in range(v.shape[1])}
 

@@ -160,7 +160,7 @@ def linearise(
     return Linearisation(*engine_of(scene, contact).linearise(scene, state, ctrl, contact))
 
 
-def clamped(scene: Scene, controls: Float[Array, "horizon nu"]) -> Iterator[str]:
+def clamped(scene: Scene, controls: Float[Array | np.ndarray, "horizon nu"]) -> Iterator[str]:
     """Yield that controls leave their actuator's range, if they are known and do."""
     model, numbers, ends = scene.mj_model, known(controls), known(scene.model.actuator_ctrlrange)
     if numbers is None or ends is None or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:

@@ -36,6 +36,7 @@ from mjxgrad.scene.scene import (
 from mjxgrad.stepping import EngineName
 
 _FLOAT32_TOLERANCE = 1e-6
+_SHORT = 1e-6  # s
 _SPARSE_FROM = 60  # degrees of freedom; MJX's own threshold
 
 
@@ -109,7 +110,10 @@ def load_scene(
         model, data, mj_model, omissions, tuple(conversions), pairs, name, unsupported, chosen, max_contacts  # pyright: ignore[reportArgumentType]
     )  # fmt: skip
     messages = [f"MuJoCo says: {text}" for text in told]
-    messages += [f"a time step of {timestep:g} s is long: give seconds"] if timestep and timestep > 0.1 else []
+    if timestep and timestep > 0.1:
+        messages.append(f"a time step of {timestep:g} s is long: give seconds")
+    if (step := mj_model.opt.timestep) < _SHORT:
+        messages.append(f"a time step of {step:g} s is short: a second of motion takes {1 / step:.0e} steps")
     head, *more = unsupported.splitlines() or [""]
     alone = head.removeprefix(f"{name} cannot be stepped by MJX: ")
     reasons = "; ".join(one.strip(" -").partition(", got")[0] for one in more or [alone])

@@ -52,8 +52,8 @@ def ball(timestep=0.002, height=0.3, gear=1, contact=""):
     return BALL.format(timestep=timestep, height=height, gear=gear, contact=contact)
 
 
-def quick(source):
-    return mg.check(source, derivatives=False)
+def quick(source, cost=None):
+    return mg.check(source, cost, derivatives=False)
 
 
 def kinds(verdict):
@@ -136,6 +136,18 @@ def test_motions_that_leave_all_numbers_are_named():
     """A spring of 1e7 N/m on 0.2 kg, integrated explicitly: h²k/m = 200, beyond 4."""
     unstable = ball().replace('motor name="push" joint="z" gear="1"', 'position name="push" joint="z" kp="1e7"')
     assert "not_finite" in kinds(quick(unstable))
+
+
+def test_a_start_that_is_none_is_named():
+    key = ball().replace("</mujoco>", '<keyframe><key name="home" qpos="nan"/></keyframe></mujoco>')
+    assert fault(quick(key), "not_finite") == "Key frame home must hold numbers, got NaN."
+    assert "ball in floor begins 250 mm deep" in fault(quick(ball(height=-0.2)), "start")
+
+
+def test_an_index_beyond_an_array_is_named():
+    """JAX takes the last number in silence."""
+    assert "index 9 is out of bounds" in fault(quick(ball(), cost=lambda motion: motion.qpos[-1, 9] ** 2), "index")
+    assert "index" not in kinds(quick(ball(), cost=lambda motion: motion.qpos.at[-1, 0].get() ** 2))
 
 
 def test_the_first_touch_is_that_of_free_fall():

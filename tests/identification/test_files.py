@@ -47,6 +47,7 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
     }
     _write(tmp_path / "a.csv", **columns | {"camera": ["far", "near", "near"]})
     arrays = {name: np.array([np.nan if v == "" else v for v in column]) for name, column in columns.items()}
+    arrays["camera"] = np.array(["far", "near", "near"])
     del arrays["ctrl:x"], arrays["servo"], arrays["qvel[6]"]
     arrays["ctrl"] = np.array([[1, 4], [2, 5], [3, 6]])
     arrays["qvel"] = np.column_stack([np.full((3, 6), np.nan), [0.7, 0.8, 0.9]])
