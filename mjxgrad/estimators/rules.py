@@ -170,7 +170,7 @@ class LeastRisk(eqx.Module):
 
     Derivatives that scatter about the right mean leave much unexplained, but no more than they scatter; derivatives that miss
     jumps do. With $J$ the part of $U$ that scatter does not explain, $pJ/n$ is the part of $V^0$ that is due to jumps. $V$ is at
-    least that, and so jumps show at once. For the price of a mistake it is also at least $V^0/100$.
+    least that, and so jumps show at once; and at least $V^0/100$, for no derivative is trusted without limit.
 
     In a descent (see `Memory`) $D$ is that of the mean over its last steps, and $b^2$ counts as many times as there are steps
     over which noise averages.
