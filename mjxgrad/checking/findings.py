@@ -390,10 +390,10 @@ def headline(
     words = {
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
-        "start": "the start is a bad one",
         "index": "the cost looks beyond an array",
         "cost": "the cost has no derivative",
         "engines": "MJX moves it otherwise",
+        "start": "it begins in a bad pose",
         "no_contact": "nothing touches",
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",
