@@ -92,8 +92,9 @@ class GradientStep(Descent):
     annealing: Annealing | None
 
     def __check_init__(self):
-        function("annealing", self.annealing, "step")
-        if self.annealing is None:
+        schedule = self.annealing
+        function("annealing", schedule, "step")
+        if schedule is None:
             as_objective(self.objective)
         elif isinstance(self.objective, Objective):
             raise ValueError(
@@ -101,9 +102,9 @@ class GradientStep(Descent):
                 "write lambda scale: objective.with_stddev(scale * stddev)"
             )
         else:
-            real("the scale of annealing", self.annealing(0))
+            real("the scale of annealing", schedule(0))
             steps = jnp.arange(self.options.num_steps)
-            scales = known(jax.vmap(lambda step: jnp.asarray(self.annealing(step), float))(steps))
+            scales = known(jax.vmap(lambda step: jnp.asarray(schedule(step), float))(steps))
             if scales is not None and not np.isfinite(scales).all():
                 step = int(np.argmin(np.isfinite(scales)))
                 raise ValueError(f"the scale of annealing must be finite, got {scales[step]} in step {step}")
