@@ -83,11 +83,12 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
     if bad:
         first = float(motions.bad_steps[motions.bad_steps >= 0].min() * motions.timestep)
         text = f"From {bad[0]} the motion is not finite after {first:.3g} s, in C MuJoCo too: shorten the time step."
-        is_none = ~np.isfinite(motions.qpos[np.argmax(motions.bad_steps >= 0), 0]).all()
-        yield Finding(
-            "not_finite", f"{bad[0][:1].upper()}{bad[0][1:]} must hold numbers, got NaN." if is_none else text, True
-        )
-    elif warned := next(pose_warnings(scene.model, scene.mj_model, motions.qpos[0, 0]), ""):
+        start = motions.state(int(np.argmax(motions.bad_steps >= 0)), 0)
+        if not all(np.isfinite(x).all() for x in (start.qpos, start.qvel, start.act)):
+            text = f"{bad[0][:1].upper()}{bad[0][1:]} must hold numbers, got NaN."
+        yield Finding("not_finite", text, True)
+    pose = motions.qpos[0, 0]
+    if np.isfinite(pose).all() and (warned := next(pose_warnings(scene.model, scene.mj_model, pose), "")):
         yield Finding("start", f"In {motions.poses[0]} {warned}.", True)
     if degrees := _in_degrees(scene.mj_model):
         text = f"In degrees? The control range of {', '.join(degrees)} is over ten times that of its joint in rad"
@@ -164,7 +165,8 @@ def cost_finding(motions: Motions, mover: Mover) -> Finding:
 
 def index_findings(scene: Scene, motions: Motions, cost: Callable[[Trajectory], Any]) -> Iterator[Finding]:
     """Yield what NumPy says of a cost that indexes beyond the trajectory's arrays, where JAX takes the last number."""
-    found = rollout(scene.with_engine(QUICK), motions.state(0, 0), motions.controls[0, :_NUM_INDEXED])
+    motion = int(np.argmax(motions.bad_steps < 0))
+    found = rollout(scene.with_engine(QUICK), motions.state(motion, 0), motions.controls[motion, :_NUM_INDEXED])
     try:
         cost(jax.tree.map(np.asarray, found))
     except Exception as error:  # any other: the cost needs arrays of JAX

@@ -83,6 +83,9 @@ def optimise(
     return dataclasses.replace(result, params=restore(result.params), best_params=restore(result.best_params))
 
 
+_CHECKED = 100_000  # steps whose scales are looked at before the first
+
+
 class GradientStep(Descent):
     """The method of `optimise`: an estimate, and a step of the optimiser along it."""
 
@@ -103,7 +106,7 @@ class GradientStep(Descent):
             )
         else:
             real("the scale of annealing", schedule(0))
-            steps = jnp.arange(self.options.num_steps)
+            steps = jnp.arange(min(self.options.num_steps, _CHECKED))
             scales = known(jax.vmap(lambda step: jnp.asarray(schedule(step), float))(steps))
             if scales is not None and not np.isfinite(scales).all():
                 step = int(np.argmin(np.isfinite(scales)))

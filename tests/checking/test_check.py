@@ -140,7 +140,10 @@ def test_motions_that_leave_all_numbers_are_named():
 
 def test_a_start_that_is_none_is_named():
     key = ball().replace("</mujoco>", '<keyframe><key name="home" qpos="nan"/></keyframe></mujoco>')
-    assert fault(quick(key), "not_finite") == "Key frame home must hold numbers, got NaN."
+    for one in (key, key.replace("qpos", "qvel")):
+        found = quick(one, cost=lambda motion: motion.qpos[-1, 9] ** 2)
+        assert fault(found, "not_finite") == "Key frame home must hold numbers, got NaN."
+        assert "index 9 is out of bounds" in fault(found, "index")  # by a motion that has numbers
     assert "ball in floor begins 250 mm deep" in fault(quick(ball(height=-0.2)), "start")
 
 
