@@ -6,6 +6,9 @@ A policy learns for a while and is frozen. Each kind of gradient then names a di
   kinds find in other windows;
 - the slope, what a long return gains along the direction that all windows find: by central differences in MuJoCo's own
   motion with the same noise on both sides, per unit of root-mean-square change of the actions.
+
+A second table says who misleads, contact or the value function: the cosine of first with zeroth order, with the value
+function, and of the window's rewards alone.
 """
 
 import dataclasses
@@ -26,7 +29,15 @@ from experiments.learning import stiffer
 from experiments.words import quantity
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
-from mjxgrad.learning.window import Gradients, Window, returned, run_window, window_gradients
+from mjxgrad.learning.window import (
+    Gradients,
+    Window,
+    lambda_returns,
+    returned,
+    run_window,
+    weights_in_return,
+    window_gradients,
+)
 from mjxgrad.stepping import Contact
 
 _KINDS = {"own": mg.Discrete(), "slope": mg.Slope(), "onset": mg.Onset()}
@@ -35,12 +46,14 @@ _MIXED = 96  # actions by which copies of a state are driven apart
 _LONG = 192  # actions of the long return, which the value function ends
 _WIDTH = 0.05  # rms change of the actions, of the central differences
 _MOST_BATCHES = 32
+_PARTS = 16  # of the windows, whose gradients are compared across
+_ALONE = "alone"  # in place of a λ: no value function, the window's rewards alone
 
 
 def gradient_audit(
     *,
-    environment: str = "ant",
-    substeps: int = 8,
+    environment: str = "diffrl_ant",
+    finer: int = 4,
     stiffness: float = 1.0,
     updates: int = 300,
     environments: int = 64,
@@ -53,8 +66,8 @@ def gradient_audit(
     """Print the table: a line per kind of gradient, λ and limit of a sample.
 
     Args:
-        environment: a name of DiffRL's tasks.
-        substeps: time steps per action.
+        environment: a name of `mg.envs.ENVIRONMENTS`.
+        finer: times, by which time steps are shorter.
         stiffness: factor of the stiffness of contact.
         updates: updates after which the policy is frozen.
         environments: copies in which it learned.
@@ -66,18 +79,23 @@ def gradient_audit(
     """
     mg.keep_compiled()
     announce(f"{environment}, contact {stiffness:g} times as stiff, {updates} updates, {windows} windows, float32")
-    settings = learning.Settings(num_environments=environments)
-    task = getattr(envs.diffrl, environment)(num_substeps=substeps)
-    task = task.with_softness(stiffer(task, stiffness))
+    task = envs.load(environment).refined(finer)
+    settings = learning.Settings(num_environments=environments).counted(float(task.interval))
+    task = task if stiffness == 1 else task.with_softness(stiffer(task, stiffness))
     learned = learning.learn(task, jax.random.key(seed), num_updates=updates, settings=settings)
     print(learned, flush=True)
     frozen = _Frozen(learned, task, settings)
     keys = jax.random.split(jax.random.key(seed + 1), 4)
     states, others = (jax.jit(lambda k: frozen.starts(k, windows))(key) for key in keys[:2])
     noise = jax.random.normal(keys[2], (windows, settings.window, task.num_actions))
-    found, references = {}, {}
-    for (name, trace), program in frozen.compiled(traces, states, noise).items():
+    found, references, agreed = {}, {}, {}
+    for (name, trace), program in frozen.compiled((*traces, _ALONE), states, noise).items():
         window, gradients = program(states, noise)
+        if trace == _ALONE:
+            gradients = dataclasses.replace(gradients, zeroth=frozen.without_value(window, noise))
+        agreed[name, trace] = _agreement(frozen, window.seen, gradients)
+        if trace == _ALONE:
+            continue
         other_window, other = program(others, noise[::-1])
         for limit in _LIMITS:
             found[name, trace, limit] = window.seen, gradients.sound.shortened(limit)[0].first
@@ -98,6 +116,31 @@ def gradient_audit(
         told = [quantity(rises.mean(), rises.std(ddof=1) / math.sqrt(len(rises)))]
         told = [quantity(x.mean(), x.std(ddof=1) / math.sqrt(len(x))) for x in cosines] + told
         print(f"| {' | '.join([name, f'{trace:g}', f'{limit:g}', *told])} |", flush=True)
+    heads = ["cosine with zeroth order", *(f"value function, λ {trace:g}" for trace in traces), "rewards alone"]
+    print(f"\n| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
+    for name in _KINDS:
+        print(f"| {' | '.join([name, *(quantity(*agreed[name, trace]) for trace in (*traces, _ALONE))])} |")
+
+
+def _agreement(frozen: "_Frozen", seen: Array, gradients: Gradients) -> tuple[float, float]:
+    """Return the cosine of both gradients' means, by products across parts of the windows alone, and its standard error."""
+    shortened, limit = gradients.sound.shortened(_LIMITS[-1])[0], len(seen) // _PARTS
+    rows = [slice(i * limit, (i + 1) * limit) for i in range(_PARTS)]
+    first, zeroth = (
+        np.stack([np.asarray(frozen.direction(seen[r], by_action[r]), float) for r in rows])
+        for by_action in (shortened.first, gradients.zeroth)
+    )
+
+    def cosine(kept: np.ndarray) -> float:
+        def across(x: np.ndarray, y: np.ndarray) -> float:
+            return x[kept].sum(0) @ y[kept].sum(0) - (x[kept] * y[kept]).sum()
+
+        lengths = across(first, first) * across(zeroth, zeroth)
+        return across(first, zeroth) / math.sqrt(lengths) if lengths > 0 else math.nan
+
+    every = np.arange(_PARTS)
+    left_out = np.array([cosine(np.delete(every, i)) for i in every])  # the jackknife
+    return cosine(every), math.sqrt((_PARTS - 1) * left_out.var())
 
 
 def _cosines(
@@ -133,17 +176,36 @@ class _Frozen:
         noise = jax.random.normal(driven, (number, _MIXED, self.task.num_actions))
         return jax.vmap(lambda state, noise: self.follow(self.params, state, noise)[1])(copies, noise)
 
-    def compiled(self, traces: tuple[float, ...], *example) -> dict:
+    def without_value(
+        self, window: Window, noise: Float[Array, "windows steps nu"]
+    ) -> Float[Array, "windows steps nu"]:
+        """Return the likelihood ratio of the window's rewards alone, less what a quadratic in the observations foretells."""
+        returns = jax.vmap(lambda one: lambda_returns(one, lambda _: jnp.zeros(()), self.settings.discount, 1.0))(
+            window
+        )
+
+        def left(returns: Float[Array, " windows"], seen: Float[Array, "windows seen"]) -> Float[Array, " windows"]:
+            x = self.learner.normaliser(seen)
+            known = jnp.concatenate([jnp.ones((len(x), 1)), x, x**2], axis=1)
+            fitted = jnp.linalg.solve(known.T @ known + jnp.eye(known.shape[1]), known.T @ returns)
+            return returns - known @ fitted
+
+        advantages = jax.vmap(left, in_axes=1, out_axes=1)(returns, window.seen)
+        weights = jax.vmap(lambda one: weights_in_return(one, self.settings.discount))(window)
+        return (weights * advantages)[..., None] * noise / self.stddev
+
+    def compiled(self, traces: tuple[float | str, ...], *example) -> dict:
         """Return programs from states and noise to windows and gradients, by kind and λ; they compile side by side."""
 
-        def lowered(contact: Contact, trace: float):
+        def lowered(contact: Contact, trace: float | str):
             task, learner, settings = self.task.with_contact(contact), self.learner, self.settings
+            value, reach = (lambda _: jnp.zeros(()), 1.0) if trace == _ALONE else (learner.target, trace)
 
             def one(state, noise: Array) -> tuple[Window, Gradients]:
                 state = dataclasses.replace(state, physics=task.completed(state.physics))
-                networks = (self.actor_of(self.params), learner.target, learner.normaliser)
+                networks = (self.actor_of(self.params), value, learner.normaliser)
                 window, _, gradients = window_gradients(
-                    task, state, learner.key, noise, *networks, self.stddev, settings.discount, trace
+                    task, state, learner.key, noise, *networks, self.stddev, settings.discount, reach
                 )
                 return window, gradients
 

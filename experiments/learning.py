@@ -15,6 +15,7 @@ from scipy.stats import mannwhitneyu
 
 import mjxgrad as mg
 from experiments import ppo
+from experiments.problems.gymnasium_v5 import gymnasium_returns
 from experiments.problems.humanoid import pushed_humanoid
 from experiments.problems.pusher import pusher
 from experiments.problems.quadruped import quadruped
@@ -41,10 +42,12 @@ NAMES = {
 }
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, ZEROTH, "#777777"), strict=True))
 Name = Literal[
-    "cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot", "pushed_humanoid"
-]
+    "cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot", "pushed_humanoid",
+    "hopper_v5", "walker2d_v5", "half_cheetah_v5", "ant_v5", "humanoid_v5",
+]  # fmt: skip
 _OURS: dict[str, Callable[..., Environment]] = {
     "pusher": pusher, "quadruped": quadruped, "trot": trot, "pushed_humanoid": pushed_humanoid,
+    **{name: envs.ENVIRONMENTS[name[:-3]] for name in get_args(Name) if name.endswith("_v5")},
 }  # fmt: skip
 _LOADERS = {name: _OURS.get(name) or getattr(envs.diffrl, name) for name in get_args(Name)}
 _OWN_STEPS = ("cartpole", *_OURS)  # whose time steps are their own
@@ -67,7 +70,8 @@ class Sizes(SettingsTable):
 class Settings(SizedSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
-    # What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, MuJoCo's trot, or a humanoid that is pushed.
+    # What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, MuJoCo's trot, a humanoid that is pushed, or
+    # gymnasium's robots, in which policies are then judged, too.
     environment: Name
     engine: EngineName = "mjx"  # who steps while learning
     # SHAC, or analytic policy gradients as in brax: no value function, other networks and rates.
@@ -77,12 +81,12 @@ class Settings(SizedSettings):
     stiffness: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)
     # Time steps per action of 1/60 s; stiffer contact needs more. Cart-pole, pusher, quadruped and trot have their own.
     num_substeps: Annotated[int, Field(ge=1)] | None = None
-    window: Annotated[int, Field(ge=1)] = learning.Settings.window  # steps of each environment per update
+    window: Annotated[int, Field(ge=1)] | None = None  # steps of each environment per update; if left out, 0.27 s
     actor_rate: Positive | None = None  # learning rate of the policy; if left out, the algorithm's
     # Standard deviations of the noise on actions at the beginning and at the end; if left out, the algorithm's.
     stddev: tuple[Positive, Positive] | None = None
-    # λ of the returns that a policy climbs; below 1 derivatives reach less far.
-    trace: Annotated[float, Field(ge=0, le=1)] = learning.Settings.trace
+    # λ of the returns that a policy climbs; below 1 derivatives reach less far. If left out, a third within 0.17 s.
+    trace: Annotated[float, Field(ge=0, le=1)] | None = None
     # Longer first-order gradients are shortened to it; in units of zeroth-order noise.
     largest_sample: Positive = learning.Settings.largest_sample
     sizes: Sizes
@@ -94,10 +98,21 @@ class Settings(SizedSettings):
             raise ValueError(f"num_substeps must be left out for the {self.environment}, whose time step is its own")
         return self
 
+    def counted(self, environment: Environment) -> "Settings":
+        """Return these settings with what is left out counted in actions."""
+        how = learning.Settings(num_environments=self.sizes.num_environments, window=self.window, trace=self.trace)
+        how = how.counted(float(environment.interval))
+        return self.model_copy(update={"window": how.window, "trace": how.trace})
+
+    @property
+    def is_gymnasiums(self) -> bool:
+        """Whether the robot is one of gymnasium's as it is there, so that a policy can be judged in that."""
+        return self.environment.endswith("_v5") and self.stiffness == (1.0,)
+
     @property
     def num_steps(self) -> int:
-        """Steps that a policy learns from in one update."""
-        return self.sizes.num_environments * self.window
+        """Steps that a policy learns from in one update, once they are `counted`."""
+        return self.sizes.num_environments * (self.window or 1)
 
     def steps_of(self, method: Method) -> float:
         """Return the steps that a method takes for an update of the others."""
@@ -115,7 +130,7 @@ class Course:
     stiffness: float
     history: History
     returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
-    finer: Float[np.ndarray, "seeds episodes"]  # the same, in time steps that are eight times shorter
+    finer: Float[np.ndarray, "seeds episodes"]  # the same, in time steps that are eight times shorter, or in gymnasium itself
     terms: dict[str, Float[np.ndarray, "seeds episodes"]]  # of the reward, means per step there
     qpos: Float[np.ndarray, "states nq"]  # of the best policy's first episode
     num_states: int  # of it
@@ -189,6 +204,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     if settings.environment == "pushed_humanoid":  # whose file MJX would convert
         given["engine"] = settings.engine
     environment = _LOADERS[settings.environment](**given).with_engine(settings.engine)
+    settings = settings.counted(environment)
     workspace.check(environment.scene)
     courses, each = [], settings.sizes.num_updates
     with workspace.stage("learning", "updates", len(settings.methods) * each) as advance_to:
@@ -277,6 +293,14 @@ def _judged_course(
 
         return jax.tree.map(np.asarray, jax.vmap(one)(learned))
 
+    def again() -> Float[np.ndarray, "seeds episodes"]:
+        if not settings.is_gymnasiums:
+            return judge(_FINER).returns
+        policies = [jax.tree.map(lambda x, i=i: x[i], learned) for i in range(settings.sizes.num_seeds)]
+        name = settings.environment[:-3]
+        run = lambda one: gymnasium_returns(name, lambda obs: act(one, obs), num_episodes=num_episodes)  # noqa: E731
+        return np.stack([run(one) for one in policies])
+
     found = judge(1)
     best = int(found.returns.mean(axis=1).argmax())
     return Course(
@@ -284,7 +308,7 @@ def _judged_course(
         stiffness=stiffness,
         history=history,
         returns=found.returns,
-        finer=judge(_FINER).returns,
+        finer=again(),
         terms=found.terms,
         qpos=found.qpos[best, 0],
         num_states=int(found.lengths[best, 0]) + 1,
@@ -425,7 +449,7 @@ def tables(outcome: Outcome) -> list[Table]:
         ]
         for course in outcome.courses
     ]
-    finer = f"in {_FINER} times shorter steps"
+    finer = "in gymnasium's own" if outcome.settings.is_gymnasiums else f"in {_FINER} times shorter steps"
     heads = ("gradient", "return in C MuJoCo", finer, "reward per step", "α", "variance, zeroth over first", "seconds")
     caption = (
         "Mean over seeds with their standard deviation. Reward per step: while learning, of the last updates. α: weight of the "

@@ -368,8 +368,8 @@ FOUND = {
     "mg.learning.learn([], key, num_updates=1)": "environment must be one mg.envs.Environment or several, got []",
     "mg.learning.Settings(window=0)": "window must be at least 1, got 0",
     "mg.learning.Settings(stddev=(0.1, 0.0))": "stddev must be positive",
-    "mg.learning.Settings(critic_batches=5)": "critic_batches must divide the 1024 states of an update, got 5",
-    "mg.learning.Settings(has_critic=False)": "trace must be 1 without a value function, got 0.9",
+    "mg.learning.Settings(window=16, critic_batches=5)": "critic_batches must divide the 1024 states of an update, got 5",
+    "mg.learning.Settings(trace=0.9, has_critic=False)": "trace must be 1 without a value function, got 0.9",
     # Arguments of another kind, or in another place.
     "mg.linearise(scene, state, jnp.zeros(3))": "ctrl must have shape (1,), one number per actuator",
     "mg.step(scene, state)": "model must be MJX's, as scene.model; for a scene and a state see mg.rollout, got Scene",

@@ -113,6 +113,7 @@ def learn(
     environments = [environment] if not isinstance(environment, Sequence) else list(environment)
     if not environments or not all(isinstance(one, Environment) for one in environments):
         raise ValueError(f"environment must be one mg.envs.Environment or several, got {environment!r:.80}")
+    settings = settings.counted(float(environments[0].interval))
     method, axes = side_by_side([ActorCritic(one, settings, num_updates) for one in environments])
     shape, over = key.shape, [None] * key.ndim
     if not isinstance(environment, Environment):

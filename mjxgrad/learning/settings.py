@@ -1,6 +1,7 @@
 """Settings for learning from short windows, and bundled contact gradients among them."""
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -75,16 +76,24 @@ def _total_force(model, data) -> Float[Array, ""]:
     return force[jnp.array(rows, int)].sum()
 
 
+# DiffRL's actions a second, and what teaches its robots per action; the same per action of 50 ms teaches ants a third less.
+_RATE, _WINDOW, _DISCOUNT, _TRACE = 60.0, 16, 0.99, 0.9
+_SHORTEST = 4  # actions of a window
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """The settings of a learner; the defaults taught ants and hoppers, with 64 environments as with 1024.
 
+    A robot's motion lasts seconds, however long its actions are. So window, discount and trace are by default those of 16
+    actions of 1/60 s, with 0.99 and 0.9 per action, over the same time; see `counted`.
+
     Attributes:
         num_environments: number of environments side by side; a GPU takes little longer for 1024, see `for_gpu`.
-        window: steps of each environment per update.
-        discount: discount per step.
+        window: steps of each environment per update; None takes 0.27 s, and four at least.
+        discount: discount per step; None takes 0.55 per second.
         trace: λ of the returns that the policy climbs, see `window`: 1 differentiates through the whole window (SHAC), 0 through
-            one step and the value function after it.
+            one step and the value function after it. None lets it fall to a third within 0.17 s.
         alpha: weight of first order, from 0 to 1: 1 is SHAC, 0 has no derivatives. None takes that of the least error in each
             update, see `mixing`: α-order.
         stddev: standard deviations of the noise on actions before squashing, in the first and in the last update.
@@ -105,9 +114,9 @@ class Settings:
     """
 
     num_environments: int = 64
-    window: int = 16
-    discount: float = 0.99
-    trace: float = 0.9
+    window: int | None = None
+    discount: float | None = None
+    trace: float | None = None
     alpha: float | None = None
     stddev: tuple[float, float] = (0.4, 0.25)
     actor_layers: tuple[int, ...] = (128, 64, 32)
@@ -123,10 +132,12 @@ class Settings:
     bundle: Bundle | None = None
 
     def __post_init__(self):
-        for name in ("num_environments", "window", "critic_iterations", "critic_batches"):
+        given = [
+            name for name in ("window", "discount", "trace", "alpha", "actor_decay") if getattr(self, name) is not None
+        ]
+        for name in ("num_environments", *{"window"}.intersection(given), "critic_iterations", "critic_batches"):
             whole(name, getattr(self, name))
-        has_decay, has_alpha = self.actor_decay is not None, self.alpha is not None
-        for name in ("actor_scale", "actor_rate", "critic_rate", *(["actor_decay"] if has_decay else [])):
+        for name in ("actor_scale", "actor_rate", "critic_rate", *{"actor_decay"}.intersection(given)):
             positive(name, getattr(self, name))
         if self.largest_sample != np.inf:  # which shortens none
             positive("largest_sample", self.largest_sample)
@@ -136,17 +147,28 @@ class Settings:
             object.__setattr__(self, name, sizes(name, getattr(self, name), "(64, 64)"))
         if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
             raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
-        for name in ("discount", "trace", *(["alpha"] if has_alpha else [])):
-            fraction(name, getattr(self, name))
-        if self.trace < 1 and not self.has_critic:
+        for name in ("discount", "trace", "alpha"):
+            if name in given:
+                fraction(name, getattr(self, name))
+        if not self.has_critic and self.trace is not None and self.trace < 1:
             raise ValueError(
                 f"trace must be 1 without a value function, got {self.trace}: there is nothing to blend with"
             )
-        if (self.num_environments * self.window) % self.critic_batches:
+        if self.window is not None and (self.num_environments * self.window) % self.critic_batches:
             raise ValueError(
                 f"critic_batches must divide the {self.num_environments * self.window} states of an update, "
                 f"got {self.critic_batches}"
             )
+
+    def counted(self, interval: float) -> "Settings":
+        """Return these settings with window, discount and trace in actions of `interval` seconds, where they are None."""
+        actions = _RATE * interval
+        # As many as the batches of the value function divide.
+        multiple = self.critic_batches // math.gcd(self.critic_batches, self.num_environments)
+        window = multiple * math.ceil(max(_WINDOW / actions, _SHORTEST) / multiple - 0.5)
+        trace = _TRACE**actions if self.has_critic else 1.0
+        own = {"window": max(window, multiple), "discount": _DISCOUNT**actions, "trace": trace}
+        return dataclasses.replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})
 
     @classmethod
     def for_gpu(cls, **changes: Any) -> "Settings":

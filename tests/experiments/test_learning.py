@@ -1,16 +1,20 @@
 """The experiment on policies: what it says is what was measured, and an interruption costs only what was not finished."""
 
 import csv
+import dataclasses
 import importlib.util
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.__main__ import main
 from experiments.config import ExperimentError
 from experiments.learning import Course, Outcome, Settings, Sizes, findings, measure, verdict
+from experiments.problems.gymnasium_v5 import gymnasium_returns
 from experiments.workspace import Workspace
+from mjxgrad import envs, learning
 
 QUICK = Settings(
     experiment="learning",
@@ -19,6 +23,7 @@ QUICK = Settings(
     size="quick",
     sizes=Sizes(num_seeds=2, num_updates=4, num_environments=2, num_episodes=2),
     num_substeps=None,
+    window=16,
 )
 
 
@@ -84,3 +89,13 @@ def test_the_quick_size_runs_and_keeps_its_course(tmp_path):
 def test_without_brax_ppo_is_refused_before_the_others_learn(tmp_path):
     with pytest.raises(ExperimentError, match=r"pip install 'mjxgrad\[playground\]'"):
         measure(QUICK.model_copy(update={"methods": ("discrete", "ppo")}), Workspace(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "size"), [("hopper", 3), ("humanoid", 17)])
+def test_gymnasium_itself_judges_as_our_environment_does(name, size, key):
+    """A robot that pushes by half its strength, and falls; starts differ, so means of eight within five standard errors."""
+    act = lambda obs: jnp.full(size, 0.5)  # noqa: E731
+    fallen = dataclasses.replace(envs.load(name), episode_length=100)
+    ours = np.asarray(learning.evaluate(fallen, act, key, num_episodes=8).returns)
+    theirs = gymnasium_returns(name, act, num_episodes=8)
+    assert abs(ours.mean() - theirs.mean()) < 5 * np.sqrt((ours.var(ddof=1) + theirs.var(ddof=1)) / 8)

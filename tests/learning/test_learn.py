@@ -30,6 +30,25 @@ def cartpole():
     return envs.load("diffrl_cartpole")
 
 
+@pytest.mark.parametrize(("interval", "window"), [(1 / 60, 16), (0.05, 5), (0.008, 33), (0.2, 4)])
+def test_what_is_left_out_lasts_the_same_seconds_at_any_rate(interval, window):
+    """Of actions of 1/60 s: 16, 0.99 and 0.9 of each; what is given stays."""
+    found = learning.Settings().counted(interval)
+    assert found.window == window
+    assert_allclose(found.discount ** (1 / interval), 0.99**60, rtol=1e-12)
+    assert_allclose(found.trace ** (1 / interval), 0.9**60, rtol=1e-12)
+    assert learning.Settings(window=7, discount=0.9, trace=0.5).counted(interval) == learning.Settings(
+        window=7, discount=0.9, trace=0.5
+    )
+
+
+def test_a_window_that_is_left_out_fits_the_batches_of_the_value_function():
+    odd = learning.Settings(num_environments=6, critic_batches=4).counted(0.02)
+    assert odd.num_environments * odd.window % 4 == 0
+    assert abs(odd.window - 16 / 1.2) <= 1
+    assert learning.Settings(has_critic=False).counted(0.02).trace == 1
+
+
 def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     learn = functools.partial(learning.learn, cartpole, key, num_updates=2, log_every=1, settings=SMALL)
     whole = learn()
