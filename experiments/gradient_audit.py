@@ -29,6 +29,7 @@ from experiments.learning import stiffer
 from experiments.words import quantity
 from mjxgrad import envs, learning
 from mjxgrad.envs import Environment
+from mjxgrad.learning.settings import Counted
 from mjxgrad.learning.window import (
     Gradients,
     Window,
@@ -154,7 +155,7 @@ def _cosines(
 class _Frozen:
     """A policy that no longer learns, its value function, and the states it was in."""
 
-    def __init__(self, learned: learning.Learned, task: Environment, settings: learning.Settings):
+    def __init__(self, learned: learning.Learned, task: Environment, settings: Counted):
         self.task, self.settings, self.learner = task, settings, learned.learner
         params, rest = eqx.partition(learned.policy.actor, eqx.is_inexact_array)
         self.params, unravel = ravel_pytree(params)
@@ -199,7 +200,7 @@ class _Frozen:
 
         def lowered(contact: Contact, trace: float | str):
             task, learner, settings = self.task.with_contact(contact), self.learner, self.settings
-            value, reach = (lambda _: jnp.zeros(()), 1.0) if trace == _ALONE else (learner.target, trace)
+            value, reach = (lambda _: jnp.zeros(()), 1.0) if isinstance(trace, str) else (learner.target, trace)
 
             def one(state, noise: Array) -> tuple[Window, Gradients]:
                 state = dataclasses.replace(state, physics=task.completed(state.physics))

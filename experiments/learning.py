@@ -130,7 +130,9 @@ class Course:
     stiffness: float
     history: History
     returns: Float[np.ndarray, "seeds episodes"]  # in C MuJoCo
-    finer: Float[np.ndarray, "seeds episodes"]  # the same, in time steps that are eight times shorter, or in gymnasium itself
+    finer: Float[
+        np.ndarray, "seeds episodes"
+    ]  # the same, in time steps that are eight times shorter, or in gymnasium itself
     terms: dict[str, Float[np.ndarray, "seeds episodes"]]  # of the reward, means per step there
     qpos: Float[np.ndarray, "states nq"]  # of the best policy's first episode
     num_states: int  # of it

@@ -117,8 +117,8 @@ def ant() -> Robot:
         robot_scene("ant", timestep=5e-3, max_contacts=8),
         {"alive_reward": 1.0, "healthy_height": (0.2, 1.0)},
     )
-    start = {"noise": 0.1, "is_normal": True}
-    return Robot(scene, control_weight=0.5, **healthy, **start, **_FREE | {"frame_skip": 10})
+    how = {**_FREE, "frame_skip": 10, "noise": 0.1, "is_normal": True}
+    return Robot(scene, control_weight=0.5, **healthy, **how)
 
 
 def humanoid() -> Robot:

@@ -113,12 +113,12 @@ def learn(
     environments = [environment] if not isinstance(environment, Sequence) else list(environment)
     if not environments or not all(isinstance(one, Environment) for one in environments):
         raise ValueError(f"environment must be one mg.envs.Environment or several, got {environment!r:.80}")
-    settings = settings.counted(float(environments[0].interval))
-    method, axes = side_by_side([ActorCritic(one, settings, num_updates) for one in environments])
+    counted = settings.counted(float(environments[0].interval))
+    method, axes = side_by_side([ActorCritic(one, counted, num_updates) for one in environments])
     shape, over = key.shape, [None] * key.ndim
     if not isinstance(environment, Environment):
         shape, over = (len(environments), *shape), [axes, *over]
-    each = settings.window * (environments[0].num_actions + environments[0].scene.model.nv)
+    each = counted.window * (environments[0].num_actions + environments[0].scene.model.nv)
     remedy = "fewer num_environments, or a shorter window"
     fits(f"{settings.num_environments} environments", 4.0 * settings.num_environments * each, remedy)
     where = {"log": log, "checkpoint": checkpoint, "progress": progress, "what": ("learn", "update")}

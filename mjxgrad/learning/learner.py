@@ -22,7 +22,7 @@ from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.learning.mixing import Halves, Products
 from mjxgrad.learning.networks import FINAL_SCALE, Network, Normaliser, ValueFunction
-from mjxgrad.learning.settings import Settings
+from mjxgrad.learning.settings import Counted, Settings
 from mjxgrad.learning.window import Gradients, Window, lambda_returns, window_gradients
 from mjxgrad.loop.run import Method
 
@@ -134,7 +134,7 @@ class ActorCritic(Method):
     """
 
     environment: Environment
-    settings: Settings
+    settings: Counted
     num_updates: Int[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def init(self, start: PRNGKeyArray) -> Learner:

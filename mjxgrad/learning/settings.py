@@ -160,7 +160,7 @@ class Settings:
                 f"got {self.critic_batches}"
             )
 
-    def counted(self, interval: float) -> "Settings":
+    def counted(self, interval: float) -> "Counted":
         """Return these settings with window, discount and trace in actions of `interval` seconds, where they are None."""
         actions = _RATE * interval
         # As many as the batches of the value function divide.
@@ -168,10 +168,19 @@ class Settings:
         window = multiple * math.ceil(max(_WINDOW / actions, _SHORTEST) / multiple - 0.5)
         trace = _TRACE**actions if self.has_critic else 1.0
         own = {"window": max(window, multiple), "discount": _DISCOUNT**actions, "trace": trace}
-        return dataclasses.replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})
+        return Counted(**(own | {name: value for name, value in vars(self).items() if value is not None}))
 
     @classmethod
     def for_gpu(cls, **changes: Any) -> "Settings":
         """Return settings with 1024 environments and networks twice as wide, by which hoppers fall less, and other changes."""
         given = {"num_environments": 1024, "actor_layers": (256, 128, 64), "critic_layers": (128, 128)}
         return cls(**given | changes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Counted(Settings):
+    """Settings whose window, discount and trace are numbers, by `Settings.counted`; the defaults are those of 1/60 s."""
+
+    window: int = _WINDOW
+    discount: float = _DISCOUNT
+    trace: float = _TRACE

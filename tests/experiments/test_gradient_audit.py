@@ -18,7 +18,7 @@ _STEPS, _STARTS = 8, 16
 def frozen():
     """A policy and a value function that learnt nothing; the last layer of the value function is ones, not zeros."""
     layers = {"actor_layers": (16, 8), "critic_layers": (8, 8)}
-    settings = learning.Settings(num_environments=4, window=_STEPS, trace=1.0, **layers)
+    settings = learning.Settings(num_environments=4, window=_STEPS, trace=1.0, **layers).counted(1 / 60)
     task = envs.diffrl.cartpole()
     learner = eqx.filter_jit(ActorCritic(task, settings, 1).init)(jax.random.key(0))
     learner = eqx.tree_at(lambda one: one.target.network.layers[-1].weight, learner, replace_fn=jnp.ones_like)
