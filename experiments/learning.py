@@ -87,6 +87,8 @@ class Settings(SizedSettings):
     stddev: tuple[Positive, Positive] | None = None
     # λ of the returns that a policy climbs; below 1 derivatives reach less far. If left out, a third within 0.17 s.
     trace: Annotated[float, Field(ge=0, le=1)] | None = None
+    # Per action; if left out, 0.55 per second.
+    discount: Annotated[float, Field(ge=0, le=1)] | None = None
     # Longer first-order gradients are shortened to it; in units of zeroth-order noise.
     largest_sample: Positive = learning.Settings.largest_sample
     sizes: Sizes
@@ -318,7 +320,7 @@ def _judged_course(
 
 
 def _how(settings: Settings, method: Method, environment: Environment) -> learning.Settings:
-    own = {"actor_rate": settings.actor_rate, "stddev": settings.stddev}
+    own = {"actor_rate": settings.actor_rate, "stddev": settings.stddev, "discount": settings.discount}
     changes: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
     count = settings.sizes.num_environments
     if method == "bundled":
