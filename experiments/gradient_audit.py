@@ -90,14 +90,16 @@ def gradient_audit(
     states, others = (jax.jit(lambda k: frozen.starts(k, windows))(key) for key in keys[:2])
     noise = jax.random.normal(keys[2], (windows, settings.window, task.num_actions))
     found, references, agreed = {}, {}, {}
-    for (name, trace), program in frozen.compiled((*traces, _ALONE), states, noise).items():
-        window, gradients = program(states, noise)
-        if trace == _ALONE:
-            gradients = dataclasses.replace(gradients, zeroth=frozen.without_value(window, noise))
-        agreed[name, trace] = _agreement(frozen, window.seen, gradients)
-        if trace == _ALONE:
+    for (name, trace), program in frozen.compiled(traces, states, noise).items():
+        if trace == 1:
+            window, gradients = program(states, noise, 0.0)
+            alone = dataclasses.replace(gradients, zeroth=frozen.without_value(window, noise))
+            agreed[name, _ALONE] = _agreement(frozen, window.seen, alone)
+        if trace not in traces:
             continue
-        other_window, other = program(others, noise[::-1])
+        window, gradients = program(states, noise, 1.0)
+        agreed[name, trace] = _agreement(frozen, window.seen, gradients)
+        other_window, other = program(others, noise[::-1], 1.0)
         for limit in _LIMITS:
             found[name, trace, limit] = window.seen, gradients.sound.shortened(limit)[0].first
         limited = other.sound.shortened(_LIMITS[-1])[0]
@@ -195,24 +197,26 @@ class _Frozen:
         weights = jax.vmap(lambda one: weights_in_return(one, self.settings.discount))(window)
         return (weights * advantages)[..., None] * noise / self.stddev
 
-    def compiled(self, traces: tuple[float | str, ...], *example) -> dict:
-        """Return programs from states and noise to windows and gradients, by kind and λ; they compile side by side."""
+    def compiled(self, traces: tuple[float, ...], *example) -> dict:
+        """Return programs from states, noise and a factor of the value function to windows and gradients, by kind and λ.
 
-        def lowered(contact: Contact, trace: float | str):
+        Those of λ = 1, which can do without the value function, are among them. They compile side by side.
+        """
+
+        def lowered(contact: Contact, trace: float):
             task, learner, settings = self.task.with_contact(contact), self.learner, self.settings
-            value, reach = (lambda _: jnp.zeros(()), 1.0) if isinstance(trace, str) else (learner.target, trace)
 
-            def one(state, noise: Array) -> tuple[Window, Gradients]:
+            def one(state, noise: Array, share: Array) -> tuple[Window, Gradients]:
                 state = dataclasses.replace(state, physics=task.completed(state.physics))
-                networks = (self.actor_of(self.params), value, learner.normaliser)
+                networks = (self.actor_of(self.params), lambda seen: share * learner.target(seen), learner.normaliser)
                 window, _, gradients = window_gradients(
-                    task, state, learner.key, noise, *networks, self.stddev, settings.discount, reach
+                    task, state, learner.key, noise, *networks, self.stddev, settings.discount, trace
                 )
                 return window, gradients
 
-            return jax.jit(jax.vmap(one)).lower(*example)
+            return jax.jit(jax.vmap(one, in_axes=(0, 0, None))).lower(*example, 1.0)
 
-        wanted = list(itertools.product(_KINDS, traces))
+        wanted = list(itertools.product(_KINDS, dict.fromkeys((*traces, 1.0))))
         with ThreadPoolExecutor() as pool:
             programs = list(pool.map(lambda one: one.compile(), [lowered(_KINDS[k], trace) for k, trace in wanted]))
         return {(name, trace): program for (name, trace), program in zip(wanted, programs, strict=True)}

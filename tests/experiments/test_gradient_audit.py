@@ -36,7 +36,7 @@ def test_the_slope_along_the_mean_gradient_of_a_smooth_return_is_its_norm(frozen
     programs = frozen.compiled((1.0,), states, noise)
     rise = jax.jit(frozen.rise)
     for kind in kinds:
-        window, gradients = programs[kind, 1.0](states, noise)
+        window, gradients = programs[kind, 1.0](states, noise, 1.0)
         direction = frozen.direction(window.seen, gradients.first)
         _, change = jax.jvp(lambda flat: frozen.actions(flat, states.seen), (frozen.params,), (direction,))
         slope = direction @ direction / jnp.sqrt((change**2).mean())
