@@ -47,7 +47,7 @@ Name = Literal[
 ]  # fmt: skip
 _OURS: dict[str, Callable[..., Environment]] = {
     "pusher": pusher, "quadruped": quadruped, "trot": trot, "pushed_humanoid": pushed_humanoid,
-    **{name: envs.ENVIRONMENTS[name[:-3]] for name in get_args(Name) if name.endswith("_v5")},
+    **{name: envs.ENVIRONMENTS[name.removesuffix("_v5")] for name in get_args(Name) if name.endswith("_v5")},
 }  # fmt: skip
 _LOADERS = {name: _OURS.get(name) or getattr(envs.diffrl, name) for name in get_args(Name)}
 _OWN_STEPS = ("cartpole", *_OURS)  # whose time steps are their own
@@ -301,7 +301,7 @@ def _judged_course(
         if not settings.is_gymnasiums:
             return judge(_FINER).returns
         policies = [jax.tree.map(lambda x, i=i: x[i], learned) for i in range(settings.sizes.num_seeds)]
-        name = settings.environment[:-3]
+        name = settings.environment.removesuffix("_v5")
         run = lambda one: gymnasium_returns(name, lambda obs: act(one, obs), num_episodes=num_episodes)  # noqa: E731
         return np.stack([run(one) for one in policies])
 

@@ -16,12 +16,17 @@ _OPTIONS = {
 }
 
 
+def own_robot(name: str) -> gymnasium.Env:
+    """Return gymnasium's robot of version 5; `name` is one of `mjxgrad.envs.ENVIRONMENTS`."""
+    title = "".join(word.capitalize() for word in name.split("_"))
+    return gymnasium.make(f"{title}-v5", **_OPTIONS.get(name, {}))
+
+
 def gymnasium_returns(
     name: str, act: Callable[[Float[Array, " obs"]], Float[Array, " nu"]], *, num_episodes: int
 ) -> Float[np.ndarray, " episodes"]:
-    """Run a policy without noise in gymnasium's robot of version 5; `name` is one of `mjxgrad.envs.ENVIRONMENTS`."""
-    title = "".join(word.capitalize() for word in name.split("_"))
-    robot, decide = gymnasium.make(f"{title}-v5", **_OPTIONS.get(name, {})), jax.jit(act)
+    """Run a policy without noise in gymnasium's robot of that name."""
+    robot, decide = own_robot(name), jax.jit(act)
     largest, returns = robot.action_space.high, np.zeros(num_episodes)  # pyright: ignore[reportAttributeAccessIssue]
     for episode in range(num_episodes):
         obs, _ = robot.reset(seed=episode)

@@ -79,6 +79,7 @@ def _total_force(model, data) -> Float[Array, ""]:
 # What teaches DiffRL's robots per action, of which they have 60 a second; at 8 ms it taught gymnasium's hopper less than half.
 _RATE, _WINDOW, _DISCOUNT, _TRACE = 60.0, 16, 0.99, 0.9
 _LONGEST = 0.05  # s; slower decisions are those of a slower task, and count as such actions
+_OPTIONAL = ("window", "discount", "trace", "alpha", "actor_decay")  # which may be None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,12 +133,12 @@ class Settings:
     bundle: Bundle | None = None
 
     def __post_init__(self):
-        given = [
-            name for name in ("window", "discount", "trace", "alpha", "actor_decay") if getattr(self, name) is not None
-        ]
-        for name in ("num_environments", *{"window"}.intersection(given), "critic_iterations", "critic_batches"):
+        def given(*names: str) -> list[str]:
+            return [name for name in names if name not in _OPTIONAL or getattr(self, name) is not None]
+
+        for name in given("num_environments", "window", "critic_iterations", "critic_batches"):
             whole(name, getattr(self, name))
-        for name in ("actor_scale", "actor_rate", "critic_rate", *{"actor_decay"}.intersection(given)):
+        for name in given("actor_scale", "actor_rate", "critic_rate", "actor_decay"):
             positive(name, getattr(self, name))
         if self.largest_sample != np.inf:  # which shortens none
             positive("largest_sample", self.largest_sample)
@@ -147,9 +148,8 @@ class Settings:
             object.__setattr__(self, name, sizes(name, getattr(self, name), "(64, 64)"))
         if real("stddev", self.stddev).shape != (2,) or not min(self.stddev) > 0:
             raise ValueError(f"stddev must be positive at the beginning and at the end, two numbers, got {self.stddev}")
-        for name in ("discount", "trace", "alpha"):
-            if name in given:
-                fraction(name, getattr(self, name))
+        for name in given("discount", "trace", "alpha"):
+            fraction(name, getattr(self, name))
         if not self.has_critic and self.trace is not None and self.trace < 1:
             raise ValueError(
                 f"trace must be 1 without a value function, got {self.trace}: there is nothing to blend with"

@@ -1,36 +1,22 @@
 """Gymnasium's robots see, earn and end what gymnasium's own do in the same states."""
 
-import sys
-import types
-
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from experiments.problems.gymnasium_v5 import own_robot
 from mjxgrad.envs import load
 from mjxgrad.rollouts import initial_state
 
-_UNSEEN = dict.fromkeys(("cinert", "cvel", "qfrc_actuator", "cfrc_ext"), False)
-OPTIONS = {
-    "hopper": {},
-    "half_cheetah": {},
-    "walker2d": {},
-    "ant": {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0},
-    "humanoid": {f"include_{k}_in_observation": v for k, v in _UNSEEN.items()} | {"contact_cost_weight": 0},
-}
+ROBOTS = ("hopper", "half_cheetah", "walker2d", "ant", "humanoid")
 LIFT = 0.9  # m: beyond the heights at which walker, ant and humanoid are healthy
 
 
 def _theirs(name, num_episodes=4, num_steps=15):
     """Step gymnasium's robot at random, beyond ends, two episodes from the air: all it told, and states before and after."""
-    title = "".join(word.capitalize() for word in name.split("_"))
-    with pytest.MonkeyPatch.context() as patch:
-        # It is imported for windows alone.
-        patch.setitem(sys.modules, "imageio", sys.modules.get("imageio", types.ModuleType("imageio")))
-        robot = gymnasium.make(f"{title}-v5", **OPTIONS[name]).unwrapped
+    robot = own_robot(name).unwrapped
     data, random, rows = robot.data, np.random.default_rng(0), []
     simulate = robot.do_simulation
 
@@ -55,7 +41,7 @@ def _theirs(name, num_episodes=4, num_steps=15):
     return rows
 
 
-@pytest.fixture(scope="module", params=list(OPTIONS))
+@pytest.fixture(scope="module", params=ROBOTS)
 def both(request):
     """What gymnasium's robot told, and what ours makes of the same states."""
     rows = _theirs(request.param)
