@@ -76,7 +76,7 @@ def learn(
     - `reward`, mean per step; `return`, mean over the episodes that ended, NaN without any;
     - `alpha`, weight of first order; `gradient_norm`, norm of the gradient by the parameters;
     - `agreement`, cosine between the gradients of two halves of the environments: near 0 they are noise;
-    - `cosine`, between the means of both gradients, of the last twenty updates: far below 1 derivatives are biased;
+    - `cosine`, between the means of both gradients, of the last fifty updates: far below 1 derivatives are biased;
     - `first_variance` and `zeroth_variance`, of both gradients by the parameters, from the two halves;
     - `ended`, share of windows in which an episode ended for good: no derivative passes such an end;
     - `not_finite`, share of first-order gradients that were not finite; `shortened`, share of those that were too large, see

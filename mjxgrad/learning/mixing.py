@@ -10,9 +10,13 @@ $\bar d = g$ this weighs by inverse variance. Where $d$ points at no good, $\bar
 holds a policy where the return still rises.
 
 All products are known without bias from the gradients of two halves of the environments: products across halves have no
-noise, and half the difference of halves has the mean's. A batch knows them roughly, the last twenty updates better. What
-they leave open is taken in favour of first order: $|g|^2$ is less two standard errors, $\bar d \cdot g$ more two. In a few
+noise, and half the difference of halves has the mean's. A batch knows them roughly, the last fifty updates better. What
+they leave open is taken in favour of first order: $|g|^2$ is less a standard error, $\bar d \cdot g$ more one. In a few
 environments, where zeroth order is noise, no bias can then be seen, and $\alpha$ is 1.
+
+**Over many updates.** A policy moves along many gradients, over which noise averages out and bias does not. So what counts is
+the error of the mean of $K$ updates, with $V^1/K$ and $V^0/K$ in place of $V^1$ and $V^0$. $K$ is 40, over which a policy's
+direction stays much the same. With $K = 1$ a cosine of 0.6 between both gradients counts as good.
 
 References:
     Green, Strawderman. A James-Stein type estimator for combining unbiased and possibly biased estimators. Journal of the
@@ -27,9 +31,10 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PyTree
 
-_MEMORY = 0.95  # share of what was known before that stays
-# Two standard errors of such a mean, over the deviation of one update.
-_ERRORS = 2 * ((1 - _MEMORY) / (1 + _MEMORY)) ** 0.5
+_MEMORY = 0.98  # share of what was known before that stays
+# A standard error of such a mean, over the deviation of one update.
+_ERROR = ((1 - _MEMORY) / (1 + _MEMORY)) ** 0.5
+_UPDATES = 40  # over which noise averages out and bias does not
 Halves = tuple[PyTree, PyTree]
 """The parts of a mean gradient that come from either half of the environments."""
 
@@ -75,9 +80,9 @@ class Products(eqx.Module):
 
     def weights(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return $a$ and $b$ over the larger of the two; 1 and 0 where zeroth order shows nothing against first order."""
-        zeroth = jnp.maximum(self.zeroth - _ERRORS * jnp.sqrt(self.zeroth_spread), 0)
-        across = jnp.maximum(self.across + _ERRORS * jnp.sqrt(self.across_spread), 0)
-        first = jnp.maximum(self.first, 0) + self.first_noise
-        a, b = across * self.zeroth_noise, jnp.maximum(first * zeroth - across**2, 0)
+        zeroth = jnp.maximum(self.zeroth - _ERROR * jnp.sqrt(self.zeroth_spread), 0)
+        across = jnp.maximum(self.across + _ERROR * jnp.sqrt(self.across_spread), 0)
+        first = jnp.maximum(self.first, 0) + self.first_noise / _UPDATES
+        a, b = across * self.zeroth_noise / _UPDATES, jnp.maximum(first * zeroth - across**2, 0)
         most = jnp.maximum(a, b)
         return jnp.where(b > 0, a / jnp.where(b > 0, most, 1.0), 1.0), b / jnp.where(most > 0, most, 1.0)
