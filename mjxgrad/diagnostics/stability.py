@@ -250,8 +250,8 @@ def _warnings_at(speed: float, spring: Spring) -> Iterator[str]:
     reasons += [f"rises within {steps:.2g} time steps"] * (steps < _STEPS_NEEDED)
     if reasons:
         yield (
-            f"at {speed:.4g} m/s its force {' and '.join(reasons)}, which the derivative of the steps does not see; take "
-            f"contact=mg.Slope(), as tasks do by default, or an impedance from 0 over at least {_STEPS_NEEDED * travel:.2g} m"
+            f"at {speed:.4g} m/s its force {' and '.join(reasons)}, which the derivative of the steps does not see. "
+            f"contact=mg.Slope() sees it, and an impedance from 0 over at least {_STEPS_NEEDED * travel:.2g} m avoids it"
         )
 
 

@@ -28,6 +28,20 @@ _PLACES = (
 )  # fmt: skip
 
 
+@jax.tree_util.register_static
+class _Unknown:
+    """What only MJX's own data have, such as contacts: whoever asks is told so."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # as Python itself and copies ask
+            raise AttributeError(name)
+        raise ValueError(
+            f"data has no {name} by C MuJoCo and Warp, which give sensors and places: for a force between two geoms add "
+            '<sensor><contact name="push" geom1="floor" geom2="foot" data="force" reduce="netforce"/></sensor> to the MJCF, '
+            'and read mg.sensor(model, data, "push")'
+        )
+
+
 class MuJoCo:
     """MuJoCo itself; see `engines.engine.Engine`."""
 
@@ -221,5 +235,5 @@ def observed(
         return jnp.full_like(value, jnp.nan) if is_number else value
 
     # Forces and accelerations that only MuJoCo has would be zeros of the template.
-    data: mjx.Data = jax.tree.map(unknown, scene.data).replace(**known)
+    data: mjx.Data = jax.tree.map(unknown, scene.data).replace(**known, _impl=_Unknown())
     return observe(scene.model.replace(sensor_needstage=scene.mj_model.sensor_needstage), data)  # pyright: ignore[reportCallIssue]

@@ -35,13 +35,25 @@ class _Adapter:
         self.environment = load(environment) if isinstance(environment, str) else environment
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f'render_mode must be "rgb_array" or None, got {render_mode!r}')
-        self.render_mode, self._view = render_mode, view
+        self.render_mode, self._view, self._state = render_mode, view, None
         self.metadata = {**self.metadata, "render_fps": round(1 / float(self.environment.interval))}
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
         super().reset(seed=seed, options=options)
         self._copy_key, self._state = self._begin(jax.random.key(int(self.np_random.integers(2**31))))
         return np.asarray(self._state.obs), self._info(self._state)
+
+    def _given(self, action: np.ndarray) -> tuple[Array, EnvState, Array]:
+        """Return the copies' keys, their states and an action, of which all numbers are finite."""
+        if not np.isfinite(action := np.asarray(action)).all():
+            raise ValueError(f"action must be finite, got {np.count_nonzero(~np.isfinite(action))} that are not")
+        return self._copy_key, self._begun, jnp.asarray(action)
+
+    @property
+    def _begun(self) -> EnvState:
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("reset must be called first")
+        return self._state
 
     def _spaces(self) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
         obs = jax.eval_shape(self.environment.reset, jax.random.key(0)).obs
@@ -72,13 +84,13 @@ class GymEnv(_Adapter, gymnasium.Env):
         self._advance = jax.jit(lambda key, state, action: self.environment.randomised(key).step(state, action))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, _Info]:
-        state = self._state = self._advance(self._copy_key, self._state, jnp.asarray(action))
+        state = self._state = self._advance(*self._given(action))
         ends = bool(state.terminated), bool(state.truncated)
         return np.asarray(state.obs), float(state.reward), *ends, self._info(state)
 
     def render(self) -> np.ndarray | None:
         """Draw the present state, in the render mode "rgb_array"."""
-        return None if self.render_mode is None else self._drawn(self._state.physics.qpos[None])[0]
+        return None if self.render_mode is None else self._drawn(self._begun.physics.qpos[None])[0]
 
     def _info(self, state: EnvState) -> _Info:
         return {name: float(value) for name, value in state.metrics.items()}
@@ -104,7 +116,7 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
         self._advance = jax.jit(jax.vmap(advance))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Info]:
-        ended, self._state = self._advance(self._copy_key, self._state, jnp.asarray(actions))
+        ended, self._state = self._advance(*self._given(actions))
         done = np.asarray(ended.done)
         infos = {**self._ends(ended, done), **self._info(self._state)}
         outcome = (np.asarray(x) for x in (self._state.obs, ended.reward, ended.terminated, ended.truncated))
@@ -112,7 +124,7 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw the present state of each copy, in the render mode "rgb_array"."""
-        return None if self.render_mode is None else tuple(self._drawn(self._state.physics.qpos))
+        return None if self.render_mode is None else tuple(self._drawn(self._begun.physics.qpos))
 
     def _info(self, state: EnvState) -> _Info:
         """Return the metrics in gymnasium's layout: arrays, each with a mask of the copies that have it."""

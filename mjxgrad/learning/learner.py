@@ -89,7 +89,8 @@ class Policy(eqx.Module):
             numbers = [found[name] for name in blank.arrays if name != "scale"]  # in the order of the leaves
             return jax.tree.unflatten(jax.tree.structure(blank), numbers)
         except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-            raise ValueError(f"path must be of a policy that save wrote, got {path}") from error
+            what = "" if Path(path).exists() else ", which does not exist"
+            raise ValueError(f"path must be of a policy that save wrote, got {path}{what}") from error
 
 
 class Learner(eqx.Module):

@@ -11,6 +11,7 @@ import math
 import sys
 import threading
 import time
+import warnings
 import zipfile
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -175,6 +176,9 @@ def run(
                 f"checkpoint must hold finite parameters, got {path} with NaN or infinity; use another path"
             )
         done = Progress(_placed(carry, sharding), found, seconds)
+        if done.num_steps > num_steps:
+            told = f"{path} has {done.num_steps} {what[1]}s, so that a run of {num_steps} has nothing to do"
+            warnings.warn(f"{told}: the result is that of all {done.num_steps}", stacklevel=3)
     else:
         first = patiently(begun.lower().compile)
         done = done._replace(carry=patiently(lambda: jax.block_until_ready(first(numbers, start))))

@@ -198,7 +198,7 @@ def contact_force(model: mjx.Model, data: mjx.Data, first: str, second: str) -> 
     """Return the force that the first geom exerts on the second through all their contacts.
 
     It is meant for `observe=` of a rollout: `lambda model, data: mg.contact_force(model, data, "floor", "foot")`. The data has
-    constraint forces, as after `forward` or a step.
+    constraint forces, as after `forward` or a step by MJX. By C MuJoCo and Warp a contact sensor of the scene tells the same.
 
     Returns:
         The force in world coordinates (N); zero where they do not touch. It does not include torques of friction.

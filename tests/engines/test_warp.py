@@ -166,7 +166,7 @@ def test_the_slope_is_c_mujocos(most_dense, monkeypatch):
 
 def test_what_warp_lacks_is_said():
     scene = mg.load_scene(CART, engine="warp")
-    with pytest.raises(ValueError, match=r"was loaded for MuJoCo Warp: leave out engine='warp'"):
+    with pytest.raises(ValueError, match=r"was loaded for MuJoCo Warp, engine='warp'; without engine= MJX steps it"):
         mg.rollout(scene, mg.initial_state(scene), np.zeros((2, 1)), contact=mg.Onset())
     bat = """<mujoco><worldbody><body mocap="true"><geom type="plane" size="1 1 .1"/></body><body pos="0 0 .1"><joint type="slide"
         axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>"""
