@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function, is_known, real, whole
 from mjxgrad._text import Paged, aligned, duration, format_number
+from mjxgrad.batched import device
 from mjxgrad.checking.check import Source, in_double, outcomes_of
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import exact_text, percent
@@ -42,6 +43,10 @@ _UNFELT = 1e-9  # of the cost, gradients that are rounding
 _PAIRS = 256  # pairs of rollouts at once
 _FEW = 8  # numbers of a direction that are printed
 _NEARER = 0.5  # of the slope's error, below which the derivative of each step is taken
+# Rollouts of each estimate that nobody chose, with derivatives; by C MuJoCo as many as take so long (s). And those of the truth.
+_FEWEST, _MOST, _LONGEST, _REFERENCE = 64, 256, 120.0, 16
+_HOPELESS = 10.0  # of the gradient, an error that is no estimate
+_NAMES = {**ESTIMATES, "none": "none"}
 
 
 def scene_task(
@@ -232,11 +237,11 @@ class Sweep(Paged):
         return found
 
     def best(self) -> list[str]:
-        """Return the estimate to take at each stiffness: that of least error; α-order where it gains more than a tenth."""
+        """Return what to take at each stiffness: what errs least, α-order only where it gains more than a tenth, or "none"."""
         errors = self.errors()
         factors = {"alpha_order": 1.1}
-        ranks = [np.nan_to_num(factors.get(name, 1.0) * x, nan=np.inf) for name, x in errors.items()]
-        return [list(errors)[number] for number in np.argmin(ranks, axis=0)]
+        ranks = np.array([np.nan_to_num(factors.get(name, 1.0) * x, nan=np.inf) for name, x in errors.items()])
+        return [list(errors)[k] if rank[k] < _HOPELESS else "none" for rank in ranks.T for k in [int(np.argmin(rank))]]
 
     @property
     def headline(self) -> str:
@@ -248,7 +253,10 @@ class Sweep(Paged):
         if np.abs(table["truth"]).max() <= _UNFELT * np.abs(self.result.cost).max():
             return "The noise does not reach the cost: what moves does not touch what counts; start nearer, or look further."
         row, best, errors = int(np.argmin(abs(self.result.knob[1] - self.own))), self.best(), self.errors()
-        taken, off = best[row], errors[best[row]][row]
+        if (taken := best[row]) == "none":
+            far = f"From {BATCH} rollouts no estimate is within {percent(_HOPELESS)} of the gradient"
+            return f"{far}: take softer contact, a shorter time step or a shorter horizon."
+        off = errors[taken][row]
         ratio = (table[f"{taken}_variance"] / table["zeroth_variance"])[row, 0]
         reach = np.abs([table[f"{taken}_bias{end}"][row, 0] for end in ("_low", "_high")]).max()
         reach /= abs(table["truth"][row, 0])
@@ -257,15 +265,17 @@ class Sweep(Paged):
             bias = percent(abs(table[f"{taken}_bias"] / table["truth"])[row, 0])
             is_biased = table[f"{taken}_is_biased"][row, 0]
             seen = f"its bias is {bias}" if is_biased else f"no bias was seen above {percent(reach)}"
-            tell = ", more samples would tell" if reach > 1 else ""
-            sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}{tell}"
+            seen = seen if is_biased or reach <= 1 else "these rollouts are too few to see its bias"
+            sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}"
         others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
         answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient."
         answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}."
-        for label, other in zip(self.labels[row + 1 :], best[row + 1 :], strict=True):
-            if other != taken:
-                return f"{answer} From {label} 1/s² on {ESTIMATES[other]}."
-        return answer
+        others = []
+        for label, other, is_off in zip(self.labels, best, map(bool, self.result.too_stiff), strict=True):
+            if self.labels.index(label) > row and not is_off and other != taken:
+                others.append(f"rom {label} 1/s² on {_NAMES[other]}")
+                taken = other
+        return f"{answer} F{', f'.join(others)}." if others else answer
 
     def __str__(self) -> str:
         errors = "\n".join([_ERRORS, *aligned(self._rows(), str.ljust)])
@@ -276,14 +286,15 @@ class Sweep(Paged):
         errors, best = self.errors(), self.best()
         head = ["stiffness, 1/s²", *(ESTIMATES[name] for name in errors), "take"]
         cells = [[percent(x) for x in errors[name]] for name in errors]
-        return [head, *map(list, zip(self.labels, *cells, [ESTIMATES[name] for name in best], strict=True))]
+        return [head, *map(list, zip(self.labels, *cells, [_NAMES[name] for name in best], strict=True))]
 
     def as_html(self) -> str:
         """Return the sweep as a self-contained page; needs `mjxgrad[render]`."""
         parts = [svg(functools.partial(self.result.plot, one), f"{one} over stiffness") for one in ("bias", "variance")]
         told = f"Bars: {self.result.confidence:.0%} intervals. Bias in cost per unit of what is moved, variance in its square."
         head, *rows = [row[:-1] for row in self._rows()]
-        mark = frozenset((i, 1 + list(self.errors()).index(name)) for i, name in enumerate(self.best()))
+        columns = list(self.errors())
+        mark = frozenset((i, 1 + columns.index(name)) for i, name in enumerate(self.best()) if name in columns)
         table = Block(table=Table(head, rows, f"{_ERRORS} The least is bold.", mark))
         details = Block(folded="Bias and variance in numbers", code=self.result.summary(self.labels))
         blocks = [table, Block(drawings=parts, caption=told), Block(text=self.question), details]
@@ -298,8 +309,8 @@ def sweep(
     *,
     stiffness: Sequence[float] = STIFFNESS,
     noise: float = 0.1,
-    num_samples: int = 256,
-    num_reference: int = 4096,
+    num_samples: int | None = None,
+    num_reference: int | None = None,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
     engine: EngineName | None = None,
@@ -314,11 +325,12 @@ def sweep(
             its tilt), reach:hand/ball (their distance, m). None is a random mix of the heaviest body's final coordinates.
         stiffness: stiffnesses to sweep (1/s²), besides the file's own.
         noise: standard deviation on each control of each step, in halves of its range; without controls, on velocities.
-        num_samples: rollouts per estimate.
-        num_reference: rollouts for the truth.
+        num_samples: rollouts per estimate; by default 256, fewer by C MuJoCo where these take more than two minutes, at least 64.
+        num_reference: rollouts for the truth, without derivatives; by default sixteen times as many.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
-        engine: who steps, see `Scene.with_engine`; by default the scene's own.
+        engine: who steps, see `Scene.with_engine`; by default a scene's own, and of a file on a CPU C MuJoCo, which compiles
+            nothing.
         **task_settings: `start`, a key frame with its controls, by default the first, else the reference pose, at rest;
             `horizon`, a number of time steps, by default half a second, but 50 to 300; `contact`, see `rollout`, by default
             `mg.Slope()`, or `mg.Discrete()` where slopes scatter so much that it errs less than half as much at the file's
@@ -334,9 +346,16 @@ def sweep(
     if not 0 < real("noise", noise) < np.inf:
         raise ValueError(f"noise must be positive and finite, got {noise}")
     whole("seed", seed, 0)
-    whole("num_samples", num_samples, 2)
+    if num_samples is not None:
+        whole("num_samples", num_samples, 2)
     function("log", log, "text")
-    scene = source if isinstance(source, Scene) else load_scene(source)
+    say, began, last = log or (lambda _: None), [], [0]
+    quick = (
+        QUICK
+        if device.is_cpu() and isinstance(task_settings.get("contact", Slope()), Slope | Discrete | None)
+        else None
+    )
+    scene = source if isinstance(source, Scene) else load_scene(source, engine=engine or quick)
     scene = scene if engine is None else scene.with_engine(engine)
     if task_settings.get("start") is None and scene.mj_model.nkey:
         task_settings["start"] = scene.mj_model.key(0).name or 0
@@ -346,6 +365,7 @@ def sweep(
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
+    say("moving from the start under noise, to see which derivative errs less and what it takes")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     why = ""
@@ -359,9 +379,18 @@ def sweep(
         if is_free and scene.pairs:
             knob, why = nearer(knob, softness, jax.random.key(seed + 1), few)
             task = knob.task
+    by, price = engine_of(scene, task.contact), {}
+    if task.num_controls:
+        price = {kind: task.horizon * seconds for kind, seconds in seconds_of(scene).items()}
+        price["gradient"] = price[getattr(task.contact, "gradient", "slope")]
+    if num_samples is None:
+        each = (
+            len(swept) * (price["gradient"] + _REFERENCE * price["motion"]) if price and by is ENGINES[QUICK] else 0.0
+        )
+        num_samples = int(np.clip(BATCH * (_LONGEST // max(BATCH * each, 1e-9)), _FEWEST, _MOST))
+    num_reference = _REFERENCE * num_samples if num_reference is None else num_reference
     given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
     given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
-    say, began, last = log or (lambda _: None), [], [0]
 
     def progress(done: int, total: int) -> None:
         began.append(time.perf_counter())  # first, when all is compiled
@@ -371,14 +400,11 @@ def sweep(
             say(f"{done} of {total} parts, {duration(left)} left")
 
     what = f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each"
-    by = engine_of(scene, task.contact)
     first = "compiling first"
-    if task.num_controls:
-        price = {kind: task.horizon * seconds for kind, seconds in seconds_of(scene).items()}
-        one = price[getattr(task.contact, "gradient", "slope")]
-        whole_price = duration(len(swept) * (num_samples * one + num_reference * price["motion"]))
+    if price:
+        whole_price = duration(len(swept) * (num_samples * price["gradient"] + num_reference * price["motion"]))
         if by is ENGINES[QUICK]:
-            what += f": {whole_price}, {BATCH * one:.2g} s a gradient"
+            what += f": {whole_price}, {BATCH * price['gradient']:.2g} s a gradient"
         else:  # nobody knows before how long that takes
             first += f", a minute or several for a robot; engine mujoco would take {whole_price}, and compiles nothing"
     say(f"{what}, by {by.title}; {first}")

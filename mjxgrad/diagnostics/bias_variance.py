@@ -211,7 +211,7 @@ class BiasVariance(eqx.Module, Printed):
             one = {name: value[i, j] for name, value in table.items()}
             truth, *biases = (_with_half(one, x, beyond) for x in ("truth", *(f"{name}_bias" for name in names)))
             biases = [text + " *" * bool(one[f"{x}_is_biased"]) for text, x in zip(biases, names, strict=True)]
-            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(self._too_stiff[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
+            label = (labels[i] if labels else format_number(swept[i])) + " !" * bool(self.too_stiff[i])  # pyright: ignore[reportArgumentType, reportOperatorIssue]
             variances = [f"{x:.2g}" if not x > beyond**2 else _EXPLODES for x in (one[f"{y}_variance"] for y in names)]
             at = [" ".join(f"{x:.3g}" for x in points[j]) if points.shape[1] < 4 else str(j)] * is_many
             lines.append([label, *at, truth, *biases, *variances, *[f"{one['alpha']:.2f}"] * has_alpha])
@@ -225,10 +225,10 @@ class BiasVariance(eqx.Module, Printed):
             "Variance: of one rollout. *: a bias that is significant over the whole table. α: the weight of first order in "
             "batches of 16 rollouts; at 0 its derivatives still lower the variance, without bias."
         )
-        return [told, *[f"!: the time step is too long for it. {text}." for text in self._too_stiff if text][:1]]
+        return [told, *[f"!: the time step is too long for it. {text}." for text in self.too_stiff if text][:1]]
 
     @property
-    def _too_stiff(self) -> list[str]:
+    def too_stiff(self) -> list[str]:
         return [next((text for text in told if _TOO_STIFF in text), "") for told in self.warnings]
 
     def summary(self, labels: Sequence[str] | None = None) -> str:

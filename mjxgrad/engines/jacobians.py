@@ -90,6 +90,7 @@ class _Row:
     near: Near | None = None  # surfaces near the state
     begun: Begun | None = None  # pairs of motions that its events begin
     is_explicit: bool = False  # whether R has all that the step does
+    is_solved: bool = True  # whether the step's solver came to an end
 
     @property
     def events(self) -> Events | None:
@@ -157,7 +158,7 @@ class Worker:
         explicit = [(k, one) for k, _, one in done if one.is_explicit]
         self._assemble(raw, explicit, names)
         for _, i, one in done:
-            if one.is_explicit and self._is_steep(one.found["state"]):
+            if one.is_explicit and one.is_solved and self._is_steep(one.found["state"]):
                 self._beside(steps.gradient, one, names)
             self._with_events(one)
             if one.begun is not None:
@@ -192,7 +193,8 @@ class Worker:
         found, row = {name: value[i] for name, value in steps.found.items()}, steps.rows[i].copy()
         if not np.isfinite(row).all() or not np.isfinite(after := self._step(self.inverse, row)).all():
             return None
-        one = _Row(row, after, found, raw, self.inverse, row, self._acceleration(row, after))
+        is_solved = bool(self.inverse.data.solver_niter.max() < self.model.opt.iterations)
+        one = _Row(row, after, found, raw, self.inverse, row, self._acceleration(row, after), is_solved=is_solved)
         row[self.layout.places["warmstart"]] = after[self.layout.places["warmstart"]]
         if steps.gradient == "slope":
             self._look(one)
@@ -281,7 +283,8 @@ class Worker:
     def _differentiate(self, one: _Row, names: list[str]) -> None:
         """Write small differences by all that is wanted: those of R, or where that lacks something those of whole steps."""
         if self.is_explicit:
-            one.is_explicit = one.by.blocks(one.clear, one.acceleration, one.raw)
+            # Differences of whole steps that found no end are noise; those of R at what they found are not.
+            one.is_explicit = one.by.blocks(one.clear, one.acceleration, one.raw) or not one.is_solved
         if not one.is_explicit:
             self._by_steps(one)
         self._by_others(one, names[1:])

@@ -251,6 +251,8 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
         table |= {f"{name}_is_biased": abs(bias) > half, f"{name}_variance": np.full((3, 1), cost[name])}
     monkeypatch.setattr(type(swept.result), "table", lambda self: table)
     np.testing.assert_allclose(swept.errors()["first"], [0.1, 0.1, np.sqrt(0.25 + 0.01 - 1e-4)], rtol=1e-6)
+    assert not swept.headline.endswith("on α-order.")  # the time step is too long for 1e6 1/s²
+    monkeypatch.setattr(type(swept.result), "too_stiff", [""] * 3)
     told = re.sub(r"[\d.e-]+ s a gradient", "0.3 s a gradient", swept.headline)
     assert told == (
         "Take first order: its variance is 0.04 of zeroth order's and no bias was seen above 2 %; 0.3 s a gradient. "
@@ -260,6 +262,12 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
     table["alpha_order_variance"][:] = 100.0
     assert swept.headline.startswith("Take zeroth order: it has no bias; ")
     assert " it is 50 % off, first order 200 %, α-order 250 %." in swept.headline
+    for name in halves:
+        table[f"{name}_variance"] = np.array([[4.0], [1e5], [4.0]])
+    assert swept.headline == (
+        "From 16 rollouts no estimate is within 1000 % of the gradient: take softer contact, a shorter time step or a shorter horizon."
+    )
+    assert swept.best() == ["first", "none", "zeroth"]
     table |= {name: np.zeros((3, 1)) for name in table if name.endswith("_bias") or name == "truth"}
     assert swept.headline.startswith("Stiffness changes nothing: nothing touches")
 

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjxgrad.engines import jacobians
 from mjxgrad.engines.pool import Pool
 from tests.engines.whole_steps import by_whole_steps
 
@@ -150,3 +151,17 @@ def test_sensors_have_the_derivative_of_whole_readings(control, sensors):
     found = np.concatenate([found["state"][0], found["ctrl"][0]], axis=1)
     assert np.abs(expected[:, 15]).max() > 1 or sensors != OF_FORCES
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_step_whose_solver_finds_no_end_takes_no_whole_steps(monkeypatch):
+    """A motion that explodes took a second for each of its steps: hundreds of whole ones, each of 200 iterations."""
+    model = mujoco.MjModel.from_xml_string(BOX.format(cone="elliptic", integrator="Euler").replace('"200"', '"1"'))
+    monkeypatch.setattr(jacobians, "_ITERATIONS", 1)
+    monkeypatch.setattr(jacobians.Worker, "_by_steps", lambda *_: pytest.fail("whole steps were taken"))
+    engine, data = Pool(model), mujoco.MjData(model)
+    before = {"time": np.zeros((1, 1, 1)), "act": np.zeros((1, 1, model.na))}
+    before |= {"qpos": data.qpos[None, None].copy(), "qvel": np.linspace(1, -2, model.nv)[None, None]}
+    found = engine.maps(
+        {}, before, {"ctrl": np.zeros((1, 1, model.nu))}, engine.no_flight((1,)), gradient="discrete", wanted=()
+    )
+    assert np.isfinite(found["state"]).all() and np.abs(found["state"]).max() > 0
