@@ -470,7 +470,8 @@ class Worker:
                 def end(
                     amount: float, put: Callable = put, shift: np.ndarray = shift, by_solution: bool = by_solution
                 ) -> np.ndarray:
-                    start = self.layout.moved(put(amount), amount * shift)
+                    start = put(amount)
+                    start = self.layout.moved(start, amount * shift) if shift.any() else start
                     if by_solution:
                         return np.concatenate(one.by.at(start, one.acceleration))
                     return self.layout.difference(self._step(one.by, start), one.after)
