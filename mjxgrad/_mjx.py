@@ -45,6 +45,13 @@ if (
 ):
     signal.signal(signal.SIGINT, _hear)
 
+# A file beside the program that has a library's name is imported in its place, and fails far from the cause.
+for _file in (
+    os.path.join(sys.path[0] or ".", f"{name}.py") for name in ("numpy", "jax", "mujoco", "equinox", "optax")
+):  # noqa: PTH118
+    if os.path.isfile(_file):  # noqa: PTH113
+        raise ImportError(f"{_file} hides the library {os.path.basename(_file)[:-3]}: rename it")  # noqa: PTH119
+
 try:
     importlib.import_module("jax")
 except ValueError as error:

@@ -56,6 +56,9 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
     ("arguments", "said"),
     [
         (["check", "nowhere.xml"], "there is no file nowhere.xml"),
+        (["check", "."], ". is a folder: name a file in it"),
+        (["sweep", "."], ". is a folder: name a file in it"),
+        (["new", "."], ". is a folder: name a file in it"),
         (["check", "refused.xml"], "got none (nv = 0)"),
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
         (
@@ -91,6 +94,14 @@ def test_what_cannot_be_done_is_said_in_one_line(scene, capsys, arguments, said)
     assert "step 0" not in told  # before the search
     assert len(line) < 500
     assert "Traceback" not in line
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("no.xml", "there is no file no.xml\n"), (".", ". is a folder: name a file in it\n")]
+)
+def test_what_is_no_file_is_said_before_how_long_a_check_takes(scene, capsys, name, said):
+    assert cli.main(["check", name]) == 2
+    assert capsys.readouterr().err == said
 
 
 @pytest.mark.parametrize(
@@ -284,6 +295,15 @@ def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatc
     monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
     assert cli.main(["new", scene, "--force"]) == 0
     assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["optax", "equinox", "numpy"])
+def test_a_file_that_hides_a_library_is_named(tmp_path, name):
+    """By the last line of the traceback; Python itself named the attribute alone."""
+    (tmp_path / f"{name}.py").write_text("")
+    (tmp_path / "program.py").write_text("import mjxgrad")
+    ended = subprocess.run([sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert ended.stderr.endswith(f"ImportError: {tmp_path / name}.py hides the library {name}: rename it\n")
 
 
 def test_the_library_imports_nothing_heavy_and_its_command_line_says_what_it_lacks():

@@ -27,6 +27,8 @@ bounded = mg.load_scene("<mujoco><worldbody><body><joint name='j' type='slide'/>
 balls = mg.load_scene("<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/><geom name='lamp' size='.1' contype='0' "
                       "conaffinity='0'/><body><freejoint name='root'/><geom name='ball' size='.1'/></body><body pos='1 0 1'>"
                       "<freejoint/><geom name='other' size='.1'/></body></worldbody></mujoco>")
+strung = mg.load_scene("<mujoco><worldbody><body><joint name='j' type='slide'/><geom size='.1'/></body></worldbody><tendon>"
+                       "<fixed name='t'><joint joint='j' coef='1'/></fixed></tendon></mujoco>", engine="mujoco")
 still = mg.initial_state(balls, qpos=balls.data.qpos.at[2].set(1.0))
 archive = tempfile.mkdtemp() + "/run.npy"
 np.save(archive, np.zeros(3))
@@ -190,7 +192,13 @@ FOUND = {
     "mg.rollout(scene, state, horizon=2, contact='slope')": 'mg.Onset() or mg.Smoothing(), got "slope"',
     "mg.Softness(geoms='ball')": "geoms must be a tuple of names, got 'ball'; write ('ball',)",
     # Rollouts, and where they begin.
-    "roll(jnp.zeros((4, 2)))": "controls must have shape (4, 1)",
+    "roll(jnp.zeros((4, 2)))": "controls must have one row per step and 1 column, that of the actuator, got shape (4, 2)",
+    "roll(jnp.zeros(4))": "1 column, that of the actuator, got shape (4,): take controls[:, None]",
+    "planned(controls=np.zeros(2))": "controls must have one row per step and 2 columns, one per actuator, got shape (2,): "
+        "to hold them for a horizon take jnp.tile(controls, (horizon, 1))",
+    "planned(controls=np.zeros((2, 7)))": "2 columns, one per actuator, got shape (2, 7): transpose it",
+    "roll(jnp.zeros(1), horizon=5)": "controls must have one row per step and 1 column",
+    "mg.rollout(balls, still, jnp.zeros((3, 1)))": "no column, for there are no actuators, got shape (3, 1)",
     "roll(jnp.array([[0.0], [jnp.nan]]))": "controls must be finite, got nan in step 1 for actuator 0",
     "roll(jnp.zeros((4, 1)), noise=jnp.zeros((3, 1)))": "must agree on the number of steps, got controls 4",
     "roll()": "horizon must be given",
@@ -211,6 +219,8 @@ FOUND = {
     "own_motion('event')": "gradient must be one of 'discrete', 'slope', got 'event'",
     "mg.contact_force(balls.model, balls.data, 'floor', 'bal')": "no geom 'bal'; named geoms are 'floor', 'lamp', 'ball'",
     "mg.contact_force(balls.model, balls.data, 'floor', 'lamp')": "can never touch",
+    "mg.rollout(balls.with_engine('mujoco'), still, horizon=2, observe=lambda m, d: mg.contact_force(m, d, 'floor', 'ball'))":
+        "data has no contact by C MuJoCo and Warp",
     # What would take all memory, or counts that are none.
     "roll(horizon=10**12)": "horizon must be at most 2147483647, got 1000000000000",
     "roll(horizon=True)": "horizon must be a whole number, got True",
@@ -252,6 +262,7 @@ FOUND = {
     "mg.learning.evaluate(cart, None, key, num_episodes=2)": "policy must be a function of obs, got NoneType",
     "mg.learning.evaluate('ant', len, key, num_episodes=2)": "environment must be of mg.envs.Environment, got str",
     "mg.learning.evaluate(cart, len, key, num_episodes=2, engine='bullet')": "engine must be one of 'mjx', 'mujoco', 'warp', got",
+    "mg.learning.Policy.load('nix.npz')": "which does not exist",
     "mg.learning.Policy.load(archive)": "path must be of a policy that save wrote, got",
     "cart.step(state, jnp.zeros(1))": "state must be of reset or step, got State",
     "Rewarded(scene, terms={'a': 'b'}).reset(key)": "'a' in rewards of Rewarded must return one number, got str",
@@ -284,6 +295,23 @@ FOUND = {
     "scene.with_model(dof_damping=5.0)": "dof_damping must have shape (1,) in this scene, got ()",
     "scene.with_model(body_mass=jnp.array([0.0, -1]))": "body_mass must not be negative, got -1",
     "scene.with_model(timestep=0.0)": "timestep must be positive, got 0",
+    "scene.with_model(dof_damping=-5 * jnp.ones(1))": "dof_damping must not be negative, got -5",
+    "scene.with_model(dof_frictionloss=jnp.array([-0.1]))": "dof_frictionloss must not be negative, got -0.1",
+    "scene.with_model(geom_solmix=jnp.array([-1.0]))": "geom_solmix must not be negative, got -1",
+    "strung.with_model(tendon_armature=jnp.array([-1.0]))": "tendon_armature must not be negative, got -1",
+    "strung.with_model(tendon_damping=jnp.array([-1.0]))": "tendon_damping must not be negative, got -1",
+    "strung.with_model(tendon_frictionloss=jnp.array([-1.0]))": "tendon_frictionloss must not be negative, got -1",
+    "strung.with_model(tendon_lengthspring=jnp.array([[2.0, 1.0]]))": "tendon_lengthspring must have its lower ends first",
+    "strung.with_model(tendon_range=jnp.array([[2.0, 1.0]]))": "tendon_range must have its lower ends first, got [2.0, 1.0]",
+    "scene.with_model(actuator_forcerange=jnp.array([[1.0, -1.0]]))": "actuator_forcerange must have its lower ends first",
+    "scene.with_model(jnt_axis=jnp.zeros((1, 3)))": "jnt_axis must have directions, got zeros",
+    "limited.with_model(density=-1.0)": "density must not be negative, got -1",
+    "limited.with_model(viscosity=-1.0)": "viscosity must not be negative, got -1",
+    "limited.with_model(impratio=0.0)": "impratio must be positive, got 0",
+    "limited.with_model(actuator_damping=-np.ones(1))": "actuator_damping must not be negative, got -1",
+    "limited.with_model(actuator_armature=-np.ones(1))": "actuator_armature must not be negative, got -1",
+    "scene.with_model(body_inertia=jnp.array([[0.0, 0, 0], [1, 1, 5]]))":
+        "body_inertia must have no moment above the sum of the two others, which no body has, got [1.0, 1.0, 5.0]",
     "mg.load_scene(balls.mj_model, max_contacts=0)": "max_contacts must be at least 1, got 0; None has room for all",
     "mg.check_stability(balls, speed=0.0)": "speed must be positive",
     # Objectives and estimators.
@@ -331,7 +359,7 @@ FOUND = {
     "planned(schedule=np.zeros(0))": "schedule must be one factor per iteration",
     "planned(schedule=np.array([1.0, 0.0]))": "schedule must be positive, got 0: for no smoothing take Exact()",
     "planned(lower=1.0, upper=0.0)": "lower must be at most upper",
-    "planned(controls=np.zeros((3, 1)))": "controls must have shape (3, 2)",
+    "planned(controls=np.zeros((3, 1)))": "2 columns, one per actuator, got shape (3, 1)",
     "decided(deadline=0.0)": "deadline must be positive, in seconds, or None, got 0.0",
     "decided(state=(0.0, 0.0, 0.0))": "state must have shape (2,) in this system, got (3,)",
     "decided(state=(0.0, np.nan))": "state must be finite, got [0.0, nan]",

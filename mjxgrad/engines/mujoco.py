@@ -30,7 +30,7 @@ _PLACES = (
 
 @jax.tree_util.register_static
 class _Unknown:
-    """What only MJX's own data have, such as contacts: whoever asks is told so."""
+    """Stands for what only MJX's own data have, such as contacts: whoever asks is told so."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # as Python itself and copies ask

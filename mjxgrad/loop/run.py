@@ -253,7 +253,7 @@ class _Meter:
     def __init__(self, run: str, step: str, num_steps: int, tells: bool, has_log: bool):
         self.run, self.step, self.num_steps, self.tells, self.has_log = run, step, num_steps, tells, has_log
         self.seconds = self.began = self.last = 0.0  # of a step; when the first began; when something was told
-        self.is_shown = False
+        self.num_before, self.is_shown = 0, False  # steps of a checkpoint
 
     def compiled(self, compile: Callable[[], Any]) -> Any:
         """Compile, and tell of it where it takes long."""
@@ -274,7 +274,8 @@ class _Meter:
     def advanced(self, done: Progress, program: Callable[[], tuple[Array, PyTree, PyTree]]) -> Progress:
         """Take steps, return the progress with their records appended, and tell what is left."""
         began = time.perf_counter()
-        self.began = self.began or began
+        if not self.began:
+            self.began, self.num_before = began, done.num_steps
         reached, carry, rows = patiently(lambda: jax.block_until_ready(program()))
         now, count = time.perf_counter(), int(reached) - done.num_steps
         self.seconds = (now - began) / count
@@ -285,7 +286,8 @@ class _Meter:
             self.tell(f"{self.run}: {self.step} {reached} of {self.num_steps}, about {duration(left)} left")
         elif not self.is_shown and left > _LONG and now - self.began > 2 * _PULSE:
             once = f"{duration(self.seconds)} {'an' if self.step[0] in 'aeiou' else 'a'} {self.step}"
-            self.tell(f"{self.run}: {once}, about {duration(left)} for {self.num_steps}; Ctrl-C keeps what was found\n")
+            every = f"the {self.num_steps - int(reached)} left of " * (self.num_before > 0) + str(self.num_steps)
+            self.tell(f"{self.run}: {once}, about {duration(left)} for {every}; Ctrl-C keeps what was found\n")
             self.is_shown = True
         return done._replace(carry=carry, found=found, seconds=seconds)
 

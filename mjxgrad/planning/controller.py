@@ -2,10 +2,10 @@
 
 import dataclasses
 import itertools
+import math
 import time
 import warnings
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -14,18 +14,20 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from mjxgrad._arrays import real, traceable, whole
+from mjxgrad._arrays import real, whole
 from mjxgrad._text import Printed, format_number
+from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
 from mjxgrad.planning.linear_model import Exact, Smoother
-from mjxgrad.planning.system import Cost, System
+from mjxgrad.planning.system import Cost, SceneSystem, System
 from mjxgrad.planning.trajectory import Course, Problem, per_control, posed
 from mjxgrad.rollouts import State
 
-PARTS: tuple[str, ...] = ("linear models", "backward pass", "rollouts")
-"""Of an iteration, in their order."""
 _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first plan has
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
-_FADING = 0.95  # of what a part is expected to take, if it took less
+_RECENT, _QUANTILE = 20, 0.9  # a part is expected to take what so large a share of its last times stays below
+_SHARE = 0.25  # of a deadline that linear models may take between two looks at the clock
+_SHORTER = 0.95  # of the time of more steps
+_SLACK = 1.5  # times what is typical, in what is advised: other programs take cores now and then
 
 
 class Controller(Printed):
@@ -33,12 +35,15 @@ class Controller(Printed):
 
     A decision begins at the last plan, shifted by one step, and takes a few iterations of `optimise_trajectory`. It looks at the
     clock between their parts: where the next one would end after the deadline, it returns the best plan so far, and the next
-    decision goes on from there. Programs are compiled when the controller is made. `print` shows what a decision takes.
+    decision goes on from there. The shorter the deadline, the fewer steps have their linear models taken between two looks at the
+    clock, so that only a part that takes longer than the deadline by itself misses it. Programs are compiled and measured when
+    the controller is made. `print` shows what a decision is expected to take, and after the first one what decisions took.
 
     Attributes:
         cost: cost of plans; to replace it by one with other numbers, such as a moved goal, compiles nothing.
         deadline: time of a decision (s), or None.
-        price: seconds of each part of a decision, as measured when the controller was made.
+        price: seconds of each part of a decision without a deadline, as measured when the controller was made: at the scene's
+            first key frame, without any at the system's origin.
         seconds: durations of the decisions since the last reset (s).
         num_cut: number of decisions that the deadline cut short.
         num_missed: number of decisions that ended after it.
@@ -73,7 +78,8 @@ class Controller(Printed):
                 see, such as a touch from afar.
             stddev: standard deviation of these changes, in units of the controls, a number or one per control. Each plan has
                 a share of it, from an eighth to all.
-            deadline: the time of a decision (s); one part of an iteration is taken at least.
+            deadline: the time of a decision (s); one part of an iteration is taken at least. Where it is shorter than an
+                iteration more is compiled, to foretell from plans of two lengths what fits.
             lower: lower limits of the controls.
             upper: upper limits of the controls.
 
@@ -94,10 +100,12 @@ class Controller(Printed):
         if not ((self.stddev >= 0) & (self.stddev < np.inf)).all():
             raise ValueError(f"stddev must be at least 0 and finite, got {self.stddev}")
         self.system, self._cost, self.deadline = system, cost, deadline
-        self._compile(problem, start)
-        self._measure()
-        if deadline is not None and (least := sum(self.price.values()) / len(self._schedules[1])) > deadline:
-            warnings.warn(self._too_short(least), stacklevel=2)
+        self._iteration = self._prepared(problem, start)
+        self.compile_seconds = self._iteration.compile_seconds
+        self.price = {name: len(self._schedules[1]) * x for name, x in self._iteration.seconds.items()}
+        self.reset()
+        if deadline is not None and sum(self._iteration.seconds.values()) > deadline:
+            warnings.warn(self._too_short(self._one_step(problem, start), deadline), stacklevel=2)
 
     @property
     def cost(self) -> Cost:
@@ -112,48 +120,37 @@ class Controller(Printed):
             )
         self._cost = cost
 
-    def _compile(self, problem: Problem, controls: Array) -> None:
-        """Compile the three parts, at once."""
-        began, number = time.perf_counter(), self._schedules[0][0]
-        numbers, rest = eqx.partition(self.cost, eqx.is_inexact_array_like)
-        self._blank = problem.begin(self.system.origin, controls)
-        of = lambda numbers: dataclasses.replace(problem, cost=eqx.combine(numbers, rest))  # noqa: E731
-        num = len(controls)
-        # Linear models take longest. With a deadline half of them at a time: a decision may end between the halves.
-        count = num if self.deadline is None else num - num // 2
-        self._iteration = [(PARTS[0], begin) for begin in sorted({0, num - count})] + [(part, 0) for part in PARTS[1:]]
-        parts = (
-            lambda numbers, search, factor, _, begin, *__: of(numbers).linearised(search, factor, begin, count),
-            lambda numbers, search, *_: of(numbers).solved(search),
-            lambda numbers, search, _, following, __, *given: of(numbers).chosen(search, following, *given)[0],
-        )
-        self._still = np.zeros_like(self._noise(0))
-        given = numbers, self._blank, number, number, np.int32(0), np.bool_(True), self._still
-        with traceable("cost"):
-            lowered = [jax.jit(part).lower(*given) for part in parts]
-        with ThreadPoolExecutor(len(PARTS)) as threads:
-            self._programs: dict[str, Any] = dict(
-                zip(PARTS, threads.map(lambda one: one.compile(), lowered), strict=True)
-            )
-        self.compile_seconds = time.perf_counter() - began
+    def _prepared(self, problem: Problem, controls: Array) -> Iteration:
+        """Compile an iteration. With a deadline its linear models are taken of few steps at a time, as far as that pays."""
+        horizon, deadline = len(controls), self.deadline
+        given = problem, self.cost, controls, self._typical(), np.zeros_like(self._noise(0, horizon))
+        found = Iteration(*given, count=horizon)
+        if deadline is None:
+            return found
+        for _ in range(2):  # the time per step is less for many at a time
+            part, each = found.longest
+            if part != PARTS[0] or each <= _SHARE * deadline or found.count == 1:
+                break
+            # Two cores that are idle take two steps at once. Where a deadline depends on it, they may be busy soon.
+            is_urgent, wanted = each > deadline / 3, round(found.count * _SHARE * deadline / each)
+            other = found.by(min(max(1 if is_urgent else 2, wanted), found.count - 1))
+            if other.shortest > found.shortest * (_SHORTER if is_urgent else 0.5 + 0.5 * other.count / found.count):
+                found.compile_seconds = other.compile_seconds  # in vain, as on a GPU
+                break
+            found = other
+        return found
 
-    def _measure(self) -> None:
-        """Measure the parts of a decision, the least of three: what a first one prepares is kept."""
-        self.price, self._least, found = {}, dict.fromkeys(self._iteration, 0.0), []
-        self.reset()
-        for _ in range(3):
-            self(self._origin)
-            found.append(dict(self._last))
-        self.price = dict.fromkeys(PARTS, 0.0)
-        for step in self._iteration:
-            self.price[step[0]] += len(self._schedules[1]) * min(seconds[step] for seconds in found)
-        self._least = {step: min(seconds[step] for seconds in found) for step in self._iteration}
-        self.reset()
+    def _typical(self) -> Float[np.ndarray, " state"]:
+        """Return a state in which iterations are measured: the reference pose of many robots is deep in the floor."""
+        if not isinstance(self.system, SceneSystem) or not self.system.scene.mj_model.nkey:
+            return self._origin
+        key = self.system.scene.mj_model.key(0)
+        return np.concatenate([key.qpos, key.qvel, key.act]).astype(self._origin.dtype)
 
     def reset(self) -> None:
         """Forget the plan and the counts; the next decision is a first one."""
-        self._search, self._next, self.num_missed, self.num_cut = self._blank, 0, 0, 0
-        self._last, self._expected = dict(self._least), dict(self._least)
+        self._search, self._turn, self.num_missed, self.num_cut = self._iteration.blank, self._iteration.first, 0, 0
+        self._taken: dict[str, list[float]] = {part: [] for part in PARTS}
         self.seconds: list[float] = []
 
     @property
@@ -173,25 +170,32 @@ class Controller(Printed):
         Raises:
             ValueError: if the state has another size than the system's, or is not finite.
         """
-        start, is_first, began = self._vector(state), not self.seconds, time.perf_counter()
-        limit = np.inf if self.deadline is None or is_first or not self.price else self.deadline
+        began, is_first = time.perf_counter(), not self.seconds
+        start = self._vector(state)
+        limit = np.inf if self.deadline is None or is_first else began + self.deadline
         self._begin(start, is_first)
-        given = self.plan.cost
-        factors = self._schedules[0 if is_first else 1]
-        turns = [(*both, step) for both in itertools.pairwise([*factors, factors[-1]]) for step in self._iteration]
-        for number, (factor, following, step) in enumerate(turns[self._next :]):
-            before = time.perf_counter()
-            is_cut = number > 0 and before - began + self._expected[step] > limit
-            self._next = self._iteration.index(step) if is_cut else 0
-            if is_cut:
-                self.num_cut += 1
-                break
-            self._advance(step, factor, following)
+        given = float(self.plan.cost)
+        self._iterate(self._schedules[0 if is_first else 1], limit)
         self.seconds.append(time.perf_counter() - began)
-        self.num_missed += self.seconds[-1] > limit
-        if is_first and self._search.unmoved.any() and self.price and not self.plan.cost < _LITTLE * given:
+        self.num_missed += began + self.seconds[-1] > limit
+        if is_first and np.asarray(self._search.unmoved).any() and not float(self.plan.cost) < _LITTLE * given:
             warnings.warn(self._untouched(), stacklevel=2)
         return np.array(self.plan.controls)[0]
+
+    def _iterate(self, factors: np.ndarray, limit: float) -> None:
+        """Take iterations from where the last decision stopped, one part at least, up to a limit of the clock."""
+        is_late = lambda: time.perf_counter() + self._expected(self._turn[0]) > limit  # noqa: E731
+        has_begun = False
+        for both in itertools.pairwise([*factors, factors[-1]]):
+            while True:
+                if has_begun and is_late():
+                    self.num_cut += 1
+                    return
+                has_begun, turn = True, self._turn
+                self._advance(turn, both)
+                self._turn = self._iteration.after(turn)
+                if self._turn == self._iteration.first:
+                    break
 
     def _begin(self, start: np.ndarray, is_first: bool) -> None:
         """Shift all by a step, to the present state; the first time compute the course of the given controls."""
@@ -202,33 +206,33 @@ class Controller(Printed):
             known = np.asarray(x)
             return np.concatenate([known[1:], known[-1:]]) if known.ndim else known
 
-        search, horizon = self._search, len(self._blank.law.change)
-        if not is_first:
-            parts = {name: jax.tree.map(later, getattr(search, name)) for name in ("best", "models", "law")}
-            search = dataclasses.replace(search, **jax.device_put(parts))
-        states = np.tile(start, (horizon + 1, 1)) if is_first else np.array(search.best.states)
+        if is_first:
+            self._search = self._iteration.begun(start)
+            self._advance(LAST, tuple(self._schedules[0][[0, 0]]), is_first=True)
+            return
+        parts = {name: jax.tree.map(later, getattr(self._search, name)) for name in ("best", "models", "law")}
+        search = dataclasses.replace(self._search, **jax.device_put(parts))
+        states = np.array(search.best.states)
         states[0] = start
         unknown = jax.device_put(np.full_like(search.best.cost, np.inf))
         course = Course(jax.device_put(states), search.best.controls, unknown)
         self._search = dataclasses.replace(search, course=course, best=course)
-        if is_first:
-            self._advance(self._iteration[-1], *2 * [self._schedules[0][0]], is_first=True)
+        self._turn = self._iteration.moved_on(self._turn)
 
-    def _advance(
-        self, step: tuple[str, int], factor: np.generic, following: np.generic, *, is_first: bool = False
-    ) -> None:
-        """Run a part of an iteration, from a step of the plan on; its time is what the next is expected to take."""
-        began, numbers = time.perf_counter(), eqx.filter(self.cost, eqx.is_inexact_array_like)
-        part, begin = step
-        noise = self._noise(len(self.seconds)) if part == PARTS[-1] else self._still
-        given = factor, following, np.int32(begin), np.bool_(is_first), noise
-        self._search = jax.block_until_ready(self._programs[part](numbers, self._search, *given))
-        self._last[step] = time.perf_counter() - began
-        self._expected[step] = max(self._last[step], _FADING * self._expected[step])
+    def _advance(self, turn: Turn, factors: tuple[Any, Any], *, is_first: bool = False) -> None:
+        """Run a part of an iteration, and note its time."""
+        began, part = time.perf_counter(), turn[0]
+        noise = self._noise(len(self.seconds), self._iteration.horizon) if part == PARTS[-1] else None
+        self._search = self._iteration.run(turn, self.cost, self._search, factors, noise, is_first)
+        self._taken[part].append(time.perf_counter() - began)
 
-    def _noise(self, seed: int) -> Float[np.ndarray, "N horizon m"]:
+    def _expected(self, part: str) -> float:
+        recent = sorted(self._taken[part][-_RECENT:])
+        return recent[int(_QUANTILE * len(recent))] if recent else 0.0
+
+    def _noise(self, seed: int, horizon: int) -> Float[np.ndarray, "N horizon m"]:
         """Return changes of the controls, each held for a quarter of the plan, and each plan's larger than the last one's."""
-        horizon, size = self._blank.course.controls.shape
+        size = self.system.num_controls
         sizes = np.geomspace(_SMALLEST, 1, self.num_samples)[:, None, None] * self.stddev
         noise = sizes * np.random.default_rng(seed).normal(size=(self.num_samples, _PIECES, size))
         return np.repeat(noise, -(-horizon // _PIECES), axis=1)[:, :horizon].astype(self._origin.dtype)
@@ -246,11 +250,37 @@ class Controller(Printed):
             raise ValueError(f"state must be finite, got {vector.tolist()}")
         return vector
 
-    def _too_short(self, least: float) -> str:
-        assert self.deadline is not None
-        told = f"an iteration takes about {_ms(least)}, longer than the deadline of {_ms(self.deadline)}, and is spread over some"
-        steps = int(len(self._blank.course.controls) * self.deadline / least)
-        return f"{told} decisions: take a deadline of {_ms(1.2 * least)}, or a plan of {max(steps, 1)} steps"
+    def _one_step(self, problem: Problem, controls: Array) -> float:
+        """Return the time of an iteration of a plan of one step."""
+        # A part of the time is the same for all plans, so that a shorter plan takes more than its share.
+        took = sum(self._iteration.seconds.values())
+        if len(controls) == 1:
+            return took
+        problem, still = dataclasses.replace(problem, keys=problem.keys[:1]), np.zeros_like(self._noise(0, 1))
+        short = Iteration(problem, self.cost, controls[:1], self._typical(), still, count=1)
+        self.compile_seconds += short.compile_seconds
+        return min(sum(short.seconds.values()), took)
+
+    def _too_short(self, one: float, deadline: float) -> str:
+        """Return what fits a deadline that is shorter than an iteration, by the time of one of a single step, too."""
+        took, (part, each) = sum(self._iteration.seconds.values()), self._iteration.longest
+        horizon, several = self._iteration.horizon, "s" * (self._iteration.count > 1)
+        models = f"the linear model{several} of {self._iteration.count} step{several}"
+        told, remedy = (
+            f"an iteration takes about {_ms(took)}",
+            f"for one in each take a deadline of {_ms(_SLACK * took)}",
+        )
+        if _SLACK * each > deadline:
+            what = models if part == PARTS[0] else f"its {part}"
+            told += f", {what} alone {_ms(each)}, and decisions may miss the deadline of {_ms(deadline)}"
+            remedy = f"take one of {_ms(_SLACK * each)}, or for an iteration in each decision {_ms(_SLACK * took)}"
+        else:
+            num_decisions = math.ceil(_SLACK * took / deadline)
+            told += f", and is spread over some {num_decisions} decisions to keep the deadline of {_ms(deadline)}"
+        most = min(1 + (horizon - 1) * (deadline / _SLACK - one) / max(took - one, 1e-9), horizon - 1)
+        if most < 1:
+            return f"{told}: {remedy}; no plan is short enough, one of 1 step takes {_ms(one)}"
+        return f"{told}: {remedy}, or a plan of {int(most)} step{'s' * (most >= 2)}"
 
     def _untouched(self) -> str:
         places = np.flatnonzero(self._search.unmoved)
@@ -259,22 +289,24 @@ class Controller(Printed):
         return f"{told}; {helps}"
 
     def __str__(self) -> str:
-        price, parts = sum(self.price.values()), ", ".join(f"{part} {1e3 * x:.0f}" for part, x in self.price.items())
-        told = f"A decision takes about {_ms(price)} ({format_number(1 / price)} Hz): {parts}"
-        told += f"; compiled in {self.compile_seconds:.1f} s"
         if not self.seconds:
-            return told
-        rate = f"{format_number(1 / float(np.median(self.seconds)))} Hz in the median"
+            price = sum(self.price.values())
+            told = f"A decision takes about {_ms(price)} ({format_number(1 / price)} Hz): {_listed(self.price)}"
+            return f"{told}; compiled in {self.compile_seconds:.1f} s"
+        typical = float(np.median(self.seconds))
         missed = f", {self.num_missed} missed {_ms(self.deadline)}, {self.num_cut} cut short" if self.deadline else ""
-        idle = ""
-        if np.array_equal(self.plan.controls, self._blank.best.controls):
-            why = (
-                self._untouched()
-                if self._search.unmoved.any()
-                else "no small change lowers the cost: begin with others"
-            )
-            idle = f". Controls are as given, since {why}"
-        return f"{len(self.seconds)} decisions, {rate}{missed}. {told}{idle}"
+        told = f"{len(self.seconds)} decisions, {_ms(typical)} in the median ({format_number(1 / typical)} Hz){missed}"
+        parts = {part: float(np.median(taken)) for part, taken in self._taken.items()}
+        parts[PARTS[0]] *= self._iteration.num_pieces
+        told += f". An iteration took {_ms(sum(parts.values()))}: {_listed(parts)}; compiled in {self.compile_seconds:.1f} s"
+        if not np.array_equal(self.plan.controls, self._iteration.blank.best.controls):
+            return told
+        idle = "no small change lowers the cost: begin with others"
+        return f"{told}. Controls are as given, since {self._untouched() if self._search.unmoved.any() else idle}"
+
+
+def _listed(parts: dict[str, float]) -> str:
+    return ", ".join(f"{part} {1e3 * x:.0f}" for part, x in parts.items())
 
 
 def _ms(seconds: float) -> str:

@@ -181,7 +181,10 @@ def sequence_of(
     """Return the controls if they are a sequence, and the number of steps; refuse contradicting arguments."""
     given = {"controls": None if callable(controls) else controls, "noise": noise}
     given = {name: real(name, value) for name, value in given.items() if value is not None}
-    lengths = {name: len(value) for name, value in given.items() if value.ndim}
+    for name, value in given.items():
+        if value.ndim != 2 or value.shape[1] != num_controls:
+            raise ValueError(_unlike_rows(name, value.shape, num_controls))
+    lengths = {name: len(value) for name, value in given.items()}
     if horizon is not None:
         lengths["horizon"] = whole("horizon", horizon)
     if not lengths:
@@ -193,17 +196,24 @@ def sequence_of(
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
     for name, value in given.items():
-        if jnp.shape(value) != (horizon, num_controls):
-            meaning = "one row per step and one column per actuator"
-            is_turned = jnp.ndim(value) == 2 and jnp.shape(value)[0] == num_controls > 1
-            wanted = (len(value[0]) if is_turned else horizon, num_controls)
-            hint = "; transpose it" * is_turned
-            raise ValueError(f"{name} must have shape {wanted}, {meaning}, got {jnp.shape(value)}{hint}")
         numbers = known(value)  # not jnp, whose operations are traced inside jit even on known values
         if numbers is not None and not np.isfinite(numbers).all():
             row, column = np.argwhere(~np.isfinite(numbers))[0]
             raise ValueError(f"{name} must be finite, got {numbers[row, column]} in step {row} for actuator {column}")
     return given.get("controls"), horizon
+
+
+def _unlike_rows(name: str, shape: tuple[int, ...], num_controls: int) -> str:
+    columns = {0: "no column, for there are no actuators", 1: "1 column, that of the actuator"}
+    wanted = f"one row per step and {columns.get(num_controls, f'{num_controls} columns, one per actuator')}"
+    remedy = ""
+    if shape == (num_controls,):
+        remedy = f": to hold them for a horizon take jnp.tile({name}, (horizon, 1))"
+    elif len(shape) == 1 and num_controls == 1:
+        remedy = f": take {name}[:, None]"
+    elif len(shape) == 2 and shape[0] == num_controls > 1:
+        remedy = ": transpose it"
+    return f"{name} must have {wanted}, got shape {shape}{remedy}"
 
 
 def started(scene: Any, state: Any) -> State:

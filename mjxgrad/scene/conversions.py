@@ -107,10 +107,13 @@ def _least_friction(model: mujoco.MjModel) -> Iterator[Conversion]:
 def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         return
-    both = ("implicitfast", "MJX's implicitfast")
+    given = "implicitfast"
     if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
-        reason = "MJX leaves out the gyroscopic derivative of free bodies; same order of accuracy"
-        yield Conversion("integrator", *both, reason, exact=False)
+        used, reason = (
+            f"{given} without the gyroscopic derivative",
+            "MJX has none for free bodies; same order of accuracy",
+        )
+        yield Conversion("integrator", given, used, reason, exact=False)
     affine_gain = (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE) & (model.actuator_gainprm[:, 2] != 0)
     affine_bias = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 2] != 0)
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
@@ -120,8 +123,11 @@ def _implicitfast(model: mujoco.MjModel) -> Iterator[Conversion]:
     differs = muscle | ((affine_gain | affine_bias) & limited) | (affine_gain & clamped)
     if differs.any():
         names = [element_name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in np.flatnonzero(differs).tolist()]
-        reason = "its velocity derivative ignores force and control limits and muscles"
-        yield Conversion(f"integrator at {name_pairs(names)}", *both, reason, exact=False)
+        used, reason = (
+            f"{given} with a simpler derivative",
+            "MJX's velocity derivative ignores force and control limits and muscles",
+        )
+        yield Conversion(f"integrator at {name_pairs(names)}", given, used, reason, exact=False)
 
 
 def drop_sensors(model: mujoco.MjModel) -> Iterator[Conversion]:

@@ -199,7 +199,9 @@ def _converted(
     original = copy.deepcopy(model)
     try:
         if engine is not None and engine in OF_FILES:
-            raise SceneError(f"{name} was loaded for {OF_FILES[engine]}, engine={engine!r}; without engine= MJX steps it")
+            raise SceneError(
+                f"{name} was loaded for {OF_FILES[engine]}, engine={engine!r}; without engine= MJX steps it"
+            )
         if count_pairs(model) > MOST_PAIRS:
             raise SceneError(
                 f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "

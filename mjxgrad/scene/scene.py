@@ -34,7 +34,18 @@ MOST_PAIRS = 20_000
 """Largest number of geom pairs that MJX loads, since more take minutes, and that a scene lists."""
 _WIDTH = 118  # characters in a laptop's terminal
 _OPTIONS = ("timestep", "gravity", "wind")
-_NOT_NEGATIVE = {"body_mass", "body_inertia", "geom_size", "geom_friction", "pair_friction", "dof_armature", "timestep"}
+# MuJoCo's compiler refuses a few of these below zero, or at it. Its steps take the others and gain energy, or are NaN. Springs,
+# gravity compensation, margins and gaps may be negative: they have a meaning.
+_POSITIVE = {"timestep", "impratio"}
+_NOT_NEGATIVE = _POSITIVE | {
+    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "geom_size", "geom_rbound", "geom_friction",
+    "pair_friction", "geom_solmix", "dof_armature", "dof_damping", "dof_frictionloss", "dof_M0", "dof_invweight0",
+    "tendon_armature", "tendon_damping", "tendon_frictionloss", "tendon_invweight0", "actuator_armature", "actuator_damping",
+    "actuator_delay", "actuator_cranklength", "density", "viscosity",
+}  # fmt: skip
+_ORDERED = ("range", "_lengthspring")
+_DIRECTIONS = ("_quat", "_axis", "_dir")
+_ROUNDING = 1e-5  # of the largest moment of inertia: that of a plate is the sum of the others
 _EULERDAMP = mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value
 
 
@@ -129,8 +140,9 @@ class Scene(eqx.Module):
 
         Raises:
             ValueError: if there is no such field, it is not an array of numbers, or the shape differs. Known values are also
-                refused if one is NaN, or a mass, inertia, size or time step is negative; inside `jax.jit` a rollout with NaN
-                is flagged as diverged.
+                refused where one is NaN, or what no scene can have: a negative mass, size, friction, damping, armature or
+                density, moments of inertia of no body, a range from above to below, a time step of zero. Inside `jax.jit` a
+                rollout with NaN is flagged as diverged.
         """
         every = numbers_of(self.model)
         options = {name: every[f"opt.{name}"] for name in _OPTIONS}
@@ -152,16 +164,7 @@ class Scene(eqx.Module):
         # Not jnp, which jit would trace.
         known = {name: np.asarray(value) for name, value in changed.items() if is_known(value)}
         for name, numbers in known.items():
-            least, most = numbers.min(initial=np.inf), numbers.max(initial=0)
-            if np.isnan(least) or (name in _NOT_NEGATIVE and most == np.inf):
-                raise ValueError(f"{name} must hold numbers, got {'NaN' if np.isnan(least) else 'infinity'}")
-            if (name in _NOT_NEGATIVE and least < 0) or (name == "timestep" and least == 0):
-                requirement = "be positive" if name == "timestep" else "not be negative"
-                raise ValueError(f"{name} must {requirement}, got {least:g}")
-            if name.endswith("range") and (crossed := numbers[..., 0] > numbers[..., 1]).any():
-                raise ValueError(f"{name} must have its lower ends first, got {numbers[crossed][0].tolist()}")
-            if name.endswith(("_quat", "_axis")) and not np.linalg.norm(numbers, axis=-1).all():
-                raise ValueError(f"{name} must have directions, got zeros")
+            _check_numbers(name, numbers)
         if "body_mass" in known and (empty := _without_mass(self.mj_model, known["body_mass"])):
             raise ValueError(f"body_mass must leave every moving body some mass, got none for {empty}")
         if "wind" in fields and not has_medium(self.mj_model):
@@ -242,6 +245,24 @@ class Scene(eqx.Module):
 def _warn(scene: Scene, message: str) -> None:
     """Warn the caller of a scene's method; Equinox wraps methods, so this is one stack level further up."""
     warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=4)
+
+
+def _check_numbers(name: str, numbers: np.ndarray) -> None:
+    """Refuse numbers of a field that no scene can have."""
+    least, most = numbers.min(initial=np.inf), numbers.max(initial=0)
+    if np.isnan(least) or (name in _NOT_NEGATIVE and most == np.inf):
+        raise ValueError(f"{name} must hold numbers, got {'NaN' if np.isnan(least) else 'infinity'}")
+    if (name in _NOT_NEGATIVE and least < 0) or (name in _POSITIVE and least == 0):
+        raise ValueError(f"{name} must {'be positive' if name in _POSITIVE else 'not be negative'}, got {least:g}")
+    if name.endswith(_ORDERED) and (crossed := numbers[..., 0] > numbers[..., 1]).any():
+        raise ValueError(f"{name} must have its lower ends first, got {numbers[crossed][0].tolist()}")
+    if name.endswith(_DIRECTIONS) and not np.linalg.norm(numbers, axis=-1).all():
+        raise ValueError(f"{name} must have directions, got zeros")
+    if name == "body_inertia":
+        largest = numbers.max(axis=-1)
+        if (is_none := 2 * largest > (1 + _ROUNDING) * numbers.sum(axis=-1)).any():
+            told = "have no moment above the sum of the two others, which no body has"
+            raise ValueError(f"{name} must {told}, got {numbers[is_none][0].tolist()}")
 
 
 def _without_mass(model: mujoco.MjModel, mass: np.ndarray) -> str:

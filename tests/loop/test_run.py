@@ -1,5 +1,7 @@
 """The loop repeats any method: one with a start and a step alone has seeds, logs and checkpoints."""
 
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,15 @@ def test_a_log_is_told_the_means_of_a_segment(key):
     assert [step for step, _ in told] == [3, 5]
     assert told[1][1]["place"] == pytest.approx(progress.found["place"][3:].mean())
     assert told[1][1]["number"] == 3.5
+
+
+def test_a_resumed_run_says_how_many_steps_are_left(key, tmp_path, monkeypatch, capsys):
+    """Four of ten are done, and one more when it is told."""
+    for name in ("_LONG", "_PULSE"):
+        monkeypatch.setattr(sys.modules["mjxgrad.loop.run"], name, 0.0)  # not the function of this name
+    for num_steps, said in ((4, "s for 4; Ctrl-C"), (10, "s for the 5 left of 10; Ctrl-C")):
+        run(Walk(jnp.array(0.5)), key, num_steps=num_steps, segment=2, checkpoint=tmp_path / "walk.npz")
+        assert said in capsys.readouterr().err
 
 
 def test_what_is_over_takes_no_further_step(key):

@@ -1,5 +1,8 @@
 """Control by receding horizon: a pole that must stand, the clock, and where each decision begins."""
 
+import warnings
+from types import SimpleNamespace
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -9,6 +12,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.planning import Controller, Exact, FunctionSystem, GoalCost, SceneSystem, optimise_trajectory
+from mjxgrad.planning.iteration import Iteration
 
 START, GIVEN = np.array([1.0, -0.5]), jnp.full((8, 1), 0.1)
 COST = GoalCost(jnp.zeros(2), 1.0, 10.0, 0.1)
@@ -28,7 +32,7 @@ def made():
 
 @pytest.fixture
 def controller(made):
-    """One of a pendulum, whose later decisions never have time for an iteration."""
+    """One of a pendulum, whose later decisions never have time for a part of an iteration."""
     made.reset()
     made.cost = COST
     return made
@@ -48,7 +52,7 @@ def test_a_pole_stands_by_a_hundred_decisions_that_compile_nothing(compilations)
     assert len(compilations) == num_programs
     assert np.abs([data.qpos, data.qvel]).max() < 0.05
     assert str(balance).startswith("100 decisions, ")
-    assert ", 0 missed 1e5 ms, 0 cut short. A decision takes about" in str(balance)
+    assert ", 0 missed 1e5 ms, 0 cut short. An iteration took " in str(balance)
     env.reset(seed=0)
     balance.reset()
     assert not any(env.step(balance(env.data))[2] for _ in range(50))
@@ -64,14 +68,108 @@ def test_a_first_decision_is_the_plan_of_its_schedule(controller):
 
 
 def test_without_time_a_decision_is_a_part_of_an_iteration_and_counts_as_missed(controller, monkeypatch):
-    """The first one has no deadline: the course of the given controls, and five iterations of four steps."""
-    taken = []
+    """The first one has no deadline: the course of the given controls, and five iterations."""
+    taken, iteration = [], controller._iteration
     count = lambda one: lambda *given: taken.append(given) or one(*given)  # noqa: E731
-    monkeypatch.setattr(controller, "_programs", {name: count(one) for name, one in controller._programs.items()})
-    for num_missed, num_taken in ((0, 21), (1, 22), (2, 23)):
+    monkeypatch.setattr(iteration, "programs", {name: count(one) for name, one in iteration.programs.items()})
+    first = 1 + 5 * (iteration.num_pieces + 2)
+    for num_missed in range(3):
         assert np.isfinite(controller(START)).all()
-        assert (controller.num_missed, len(taken)) == (num_missed, num_taken)
-    assert ", 2 missed 1e-6 ms, 2 cut short. A decision takes about" in str(controller)
+        assert (controller.num_missed, len(taken)) == (num_missed, first + num_missed)
+    assert ", 2 missed 1e-6 ms, 2 cut short. An iteration took " in str(controller)
+
+
+def test_what_decisions_took_is_one_rate(controller):
+    """Beside what an iteration takes: a foretold rate next to a measured one contradicted it."""
+    assert str(controller).count(" Hz") == 1
+    controller(START)
+    assert str(controller).count(" Hz") == 1
+
+
+class Clock:
+    """A clock that only programs move: linear models by 10 ms and by 10 more for each step, the others as given (s)."""
+
+    def __init__(self, monkeypatch, **each):
+        self.now, self.each = 0.0, {"backward pass": 0.01, "rollouts": 0.02} | each
+        timer, run = SimpleNamespace(perf_counter=lambda: self.now), Iteration.run
+        monkeypatch.setattr("mjxgrad.planning.controller.time", timer)
+        monkeypatch.setattr("mjxgrad.planning.iteration.time", timer)
+
+        def slow(iteration, turn, *given, **how):
+            self.now += self.each.get(turn[0], 0.01 + 0.01 * iteration.count)
+            return run(iteration, turn, *given, **how)
+
+        monkeypatch.setattr(Iteration, "run", slow)
+
+    def controller(self, horizon, deadline):
+        """Return a controller and what its warning says."""
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            made = Controller(FunctionSystem(pendulum, 2, 1), COST, jnp.full((horizon, 1), 0.1), deadline=deadline)
+        return made, "".join(str(one.message) for one in told)
+
+
+def test_advice_that_is_followed_is_the_last(monkeypatch):
+    """Of 12 steps, two at a time: 6 x 30 + 10 + 20 = 210 ms; a step alone takes 20 + 10 + 20 = 50 ms.
+
+    The deadline of 120 ms leaves a third of it for other programs: 80 ms, 50 + 160 (n - 1) / 11, so 3 steps.
+    """
+    clock = Clock(monkeypatch)
+    _, told = clock.controller(12, 0.12)
+    assert "an iteration takes about 210 ms, and is spread over some 3 decisions to keep the deadline of 120 ms" in told
+    assert told.endswith("for one in each take a deadline of 315 ms, or a plan of 3 steps")
+    assert [clock.controller(*followed)[1] for followed in ((3, 0.12), (12, 0.315))] == ["", ""]
+
+
+def test_a_deadline_that_no_plan_fits_is_told_with_the_least_one(monkeypatch):
+    clock = Clock(monkeypatch, rollouts=0.1)
+    _, told = clock.controller(8, 0.1)
+    assert "its rollouts alone 100 ms, and decisions may miss the deadline of 100 ms: take one of 150 ms, or" in told
+    assert told.endswith("; no plan is short enough, one of 1 step takes 130 ms")
+
+
+def test_one_step_is_no_steps(monkeypatch):
+    """Three of them take 3 x 20 + 10 + 20 = 90 ms, and one 50; two thirds of the deadline are 53."""
+    assert Clock(monkeypatch).controller(3, 0.08)[1].endswith("a deadline of 135 ms, or a plan of 1 step")
+
+
+def test_a_short_deadline_is_kept_since_linear_models_are_taken_of_few_steps_at_a_time(monkeypatch):
+    """Half of 16 steps would take 90 ms. Two take 30, and an iteration ten decisions of 50 ms at most."""
+    controller, _ = Clock(monkeypatch).controller(16, 0.05)
+    for _ in range(40):
+        controller(START)
+    assert controller.num_missed == 0
+    assert max(controller.seconds[1:]) <= 0.05
+    assert len(controller._taken["rollouts"]) >= 4
+
+
+def test_linear_models_that_take_as_long_of_few_steps_stay_whole(monkeypatch):
+    """As on a GPU: more turns would only take longer."""
+    controller, _ = Clock(monkeypatch, **{"linear models": 0.03}).controller(8, 0.05)
+    assert controller._iteration.count == 8
+
+
+def test_every_step_s_linear_model_is_taken_though_the_plan_moves_on_meanwhile():
+    """Of nine steps two at a time, one decision each. Numbers are those of the first plan, from which none is left out."""
+    iteration = Controller(FunctionSystem(pendulum, 2, 1), COST, jnp.zeros((9, 1)))._iteration.by(2)
+    turn, taken, shift = iteration.first, [], 0
+    while turn[0] == "linear models":
+        taken += [turn[1] + shift, turn[1] + shift + 1]
+        shift += 1
+        turn = iteration.moved_on(iteration.after(turn))
+    assert set(range(shift, 9)) <= set(taken)
+    assert shift == 4  # 9 steps, three fewer in each decision: two are taken, and one is done
+
+
+def test_a_scene_is_measured_at_its_first_key_frame():
+    """The reference pose of a robot may be deep in the floor, where a step takes several times as long."""
+    xml = "<worldbody><body><joint type='slide' name='x'/><geom size='.1'/></body></worldbody>"
+    scene = mg.load_scene(
+        f"<mujoco>{xml}<actuator><motor joint='x'/></actuator><keyframe><key qpos='3' qvel='4'/></keyframe></mujoco>",
+        engine="mujoco",
+    )
+    found = Controller(SceneSystem(scene), GoalCost(jnp.zeros(2), 1.0, 1.0, 1.0), jnp.zeros((2, 1)))
+    np.testing.assert_array_equal(found._iteration._start, [3, 4])
 
 
 def test_where_nothing_is_better_the_shifted_plan_is_done():

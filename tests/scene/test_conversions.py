@@ -130,7 +130,10 @@ def _limited(actuator):
     ("source", "said"),
     [
         (_ball(flag="<flag sleep='enable'/>"), "flag sleep: disable instead of enable"),
-        (BOX.format(option="integrator='implicitfast'"), "gyroscopic derivative"),
+        (
+            BOX.format(option="integrator='implicitfast'"),
+            "integrator: implicitfast without the gyroscopic derivative instead of implicitfast: MJX has none",
+        ),
         _limited("<position kv='2' forcerange='-.1 .1' {}/>"),
         _limited("<general gaintype='affine' gainprm='1 0 -2' ctrlrange='-.1 .1' ctrllimited='true' {}/>"),
         _limited("<muscle lengthrange='-1 1' {}/>"),
