@@ -16,6 +16,7 @@ import os
 import signal
 import sys
 import threading
+from pathlib import Path
 
 _BEGAN = [os.path.basename(word) for word in sys.orig_argv[1:3]]  # noqa: PTH119 - as text, for the import is not done
 IS_COMMAND = _BEGAN[:1] == ["mjxgrad"] or _BEGAN == ["-m", "mjxgrad"]
@@ -46,11 +47,9 @@ if (
     signal.signal(signal.SIGINT, _hear)
 
 # A file beside the program that has a library's name is imported in its place, and fails far from the cause.
-for _file in (
-    os.path.join(sys.path[0] or ".", f"{name}.py") for name in ("numpy", "jax", "mujoco", "equinox", "optax")
-):  # noqa: PTH118
-    if os.path.isfile(_file):  # noqa: PTH113
-        raise ImportError(f"{_file} hides the library {os.path.basename(_file)[:-3]}: rename it")  # noqa: PTH119
+for _name in ("numpy", "jax", "mujoco", "equinox", "optax"):
+    if (_file := Path(sys.path[0], f"{_name}.py")).is_file():
+        raise ImportError(f"{_file} hides the library {_name}: rename it")
 
 try:
     importlib.import_module("jax")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from mjxgrad._interrupts import COMES_AGAIN, finished
-from mjxgrad._text import write
+from mjxgrad._text import duration, write
 
 try:
     import cyclopts
@@ -141,11 +141,12 @@ def check(
         budget: duration in s, about; the report names measurements that are left out.
         seed: seed of all random numbers.
     """
+    _existing(scene)
     _writable(html, is_page=True, beside=(scene, _source(cost)))
     log = _timed()
     log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()
-    verdict = mg.check(_existing(scene), cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
+    verdict = mg.check(scene, cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
     _print(finished(verdict.summary), sys.stdout)
     if html is not None:
         finished(lambda: write(html, verdict.as_html()))
@@ -162,7 +163,7 @@ def sweep(
     horizon: Whole | None = None,
     stiffness: Annotated[list[float] | None, Several] = None,
     noise: float = 0.1,
-    samples: Whole = 256,
+    samples: Whole | None = None,
     gradient: Literal["slope", "discrete"] | None = None,
     engine: str | None = None,
     seed: Whole = 0,
@@ -179,9 +180,10 @@ def sweep(
         horizon: number of time steps; by default half a second, but 50 to 300 steps.
         stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
-        samples: rollouts of each estimate; the truth takes sixteen times as many, without derivatives.
+        samples: rollouts of each estimate; the truth takes sixteen times as many, without derivatives. By default 256, and by C
+            MuJoCo fewer where these take more than two minutes, at least 64.
         gradient: the slope of the outcome, or the discrete one of each step; by default the slope, unless it errs twice as much.
-        engine: mjx, or mujoco for C MuJoCo, which compiles nothing and takes several times as long; by default the scene's own.
+        engine: mjx, or mujoco for C MuJoCo, which compiles nothing, the default on a CPU.
         seed: seed of all random numbers.
         html: the page to write.
     """
@@ -189,7 +191,7 @@ def sweep(
     log = _timed()
     mg = _library()
     given = {} if stiffness is None else {"stiffness": stiffness}
-    given |= {"noise": noise, "num_samples": samples, "num_reference": 16 * samples, "seed": seed, "log": log}
+    given |= {"noise": noise, "num_samples": samples, "seed": seed, "log": log}
     given |= {"start": start, "horizon": horizon, "engine": engine}
     given |= {"contact": mg.stepping.own_motion(gradient) if gradient else None}
     found = mg.sweep(_existing(scene), cost, **given)
@@ -205,7 +207,7 @@ def identify(
     parameter: Annotated[list[str], Several],
     noise: Annotated[list[str], Several] = [],  # noqa: B006
     held_out: float = 0.2,
-    start: Literal["noisy", "exact", "free"] = "noisy",
+    start: str = "noisy",
     max_steps: Whole = 100,
     output: Folder = Path("identified"),
 ) -> int:
@@ -222,17 +224,18 @@ def identify(
         parameter: kind:name or kind:name=low..high. Kinds are mass, inertia (bodies), friction, stiffness, damping_ratio,
             width (geoms, geom/geom or nothing for all), damping, armature, friction_loss (joints), gear, gains
             (actuators; kp and kv of a position servo, kv of a velocity servo), delay, and fields of the model:
-            jnt_stiffness:knee, body_pos[2]:shin. kind:one,other is one value for both.
+            jnt_stiffness:knee, body_pos[2]:shin. kind:one,other is one value for both, except an inertia.
         noise: name=standard deviation, of every measured column, or of qpos, qvel and sensors as a whole. Then the answer says
             whether more than noise is left; by default each signal is weighed by how much it varies.
         held_out: share for validation only: every n-th recording, or the end of a single one.
-        start: as the first row says, as noisy as that, and what it lacks is the scene's pose, at rest; exactly this pose, at
-            rest; or all unknown, to be found, too.
+        start: noisy: as the first row says, as noisy as that, and what it lacks is the scene's pose, at rest; exact: this
+            pose, at rest; the name of a key frame: exactly that; free: all unknown, to be found, too.
         max_steps: largest number of derivatives; ensembles of many motions are not counted.
-        output: folder for params_x_hat.yaml, identified.xml and report.html.
+        output: folder for params_x_hat.yaml, identified.xml and report.html, which are replaced where they are.
     """
-    for name in ("params_x_hat.yaml", "identified.xml", "report.html"):
-        _writable(output / name, makes_folder=True, is_page=True, beside=(scene, *recordings))
+    written = [output / name for name in ("params_x_hat.yaml", "identified.xml", "report.html")]
+    for path in written:
+        _writable(path, makes_folder=True, is_page=True, beside=(scene, *recordings))
     mg, log = _library(), _timed()
     files, page = (importlib.import_module(f"mjxgrad.identification.{name}") for name in ("files", "page"))
     if not recordings:
@@ -245,6 +248,7 @@ def identify(
     for one in told:
         if "MJX" not in str(one.message):  # C MuJoCo steps it here
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    begin = _begin(mg, loaded, start)
     wanted = {text.partition("=")[0]: files.parameter(loaded, text) for text in parameter}
     if len(wanted) < len(parameter):
         raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
@@ -259,7 +263,7 @@ def identify(
         if unknown:
             left_out.append(f"\nNot of this scene, and left out of {path}: {', '.join(unknown)}.")
             log(left_out[-1].strip())  # a slip is seen before the search
-        motions.append(dataclasses.replace(one, start=mg.initial_state(loaded)) if start == "exact" else one)
+        motions.append(dataclasses.replace(one, start=begin))
     fitted, judged = files.hold_out(motions, held_out)
     several = lambda many, word: f"{len(many)} {word}{'s' * (len(many) != 1)}"  # noqa: E731
     try:
@@ -267,12 +271,19 @@ def identify(
     except OSError as error:
         raise CommandError(f"{output} cannot be made: {error.strerror}") from error
     log(f"{several(wanted, 'parameter')}, {several(fitted, 'motion')} to fit, {len(judged)} held out")
+    if any(path.exists() for path in written):
+        log(f"replaces the results in {output} at the end; to keep them name another --output")
     given = {"delay": "delay" if "delay" in wanted else None, "free_start": True if start == "free" else None}
     log(mg.identification.outlook(loaded, wanted, fitted, **given).summary())
 
     def say(step: int, metrics: dict[str, float]) -> None:
         part = "" if metrics["share"] == 1 else f" over the first {100 * metrics['share']:.0f} %"
-        log(f"step {step}: error {metrics['rms']:.3g} {unit}{part}, about {metrics['seconds']:.0f} s to go")
+        num, index, count = (int(metrics[name]) for name in ("motions", "start", "starts"))
+        doing = f", other start {index} of {count}" if index else f", best of {count} other starts" if count > 1 else ""
+        doing += f", mean of {num} motions" if num > 1 else ""
+        log(
+            f"step {step}: error {metrics['rms']:.3g} {unit}{part}{doing}, about {duration(max(metrics['seconds'], 1))} to go"
+        )
 
     result = mg.identify(loaded, wanted, fitted, held_out=judged, max_steps=max_steps, log=say, **given)
     _print(finished(lambda: "\n".join([result.headline, "", result.summary(), *left_out])), sys.stdout)
@@ -333,6 +344,23 @@ def _library() -> Any:
     return library
 
 
+def _begin(mg: Any, scene: Any, start: str) -> Any:
+    """Return the state of an exact start; None for one that the recording tells."""
+    if start in ("noisy", "free"):
+        return None
+    keys = [name for i in range(scene.mj_model.nkey) if (name := scene.mj_model.key(i).name)]
+    if start not in ("exact", *keys):
+        known = ", ".join(keys) or "of which this scene has none"
+        raise CommandError(f"--start must be noisy, exact, free or a key frame ({known}), got {start}")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        state = mg.initial_state(scene, keyframe=None if start == "exact" else start)
+    for one in told:  # the advice of the library is for Python
+        text = str(one.message).replace("give qpos or keyframe", "name a key frame, --start NAME, or start as recorded")
+        warnings.warn_explicit(text, one.category, one.filename, one.lineno)
+    return state
+
+
 def _number(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     try:
@@ -348,6 +376,8 @@ def _folder(name: str) -> Path:
 
 
 def _existing(path: str) -> str:
+    if Path(path).is_dir():
+        raise CommandError(f"{path} is a folder: name a file in it")
     if not Path(path).is_file():
         raise CommandError(f"there is no file {path}")
     return path

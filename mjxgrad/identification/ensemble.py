@@ -13,6 +13,7 @@ References:
     Evensen. Analysis of iterative ensemble smoothers for solving inverse problems. Computational Geosciences 22 (2018).
 """
 
+import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -25,14 +26,15 @@ from mjxgrad.rollouts import DivergedError
 # Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
 MISFIT = 1.5
 _MOTIONS, _PER_NUMBER = 192, 8  # motions of an ensemble at least, and for each unknown of a window
-_MOST = 16  # ensembles
 _MORE = 4  # times as many motions at most
+EXPECTED, _MOST = 15, 16  # ensembles of the first size that a fit takes, about; ensembles of any size
 _NARROWER, _WIDER = 0.25, 2.0  # widths that are kept from before; where the mean has missed
 _APART = 2.0  # standard errors by which the next motions differ: chatter grows with it, so one would shrink to a cell
 # Factors of its variance; standard errors of a sum of squares beyond which it is more.
 _CHATTER, _EXCESS = (1.5, 3.0, 6.0, 12.0), 1.0
 _LONGEST = 3.0  # widths that a step goes at most
 _SHORT, _SETTLED = 0.7, 1.5  # at the end: step of each number in widths; ratio of successive widths
+_SURE = 0.003  # width of a coordinate: where all but noise is explained, narrower intervals are not worth the time
 # Ensembles at least, and those at the end of which the mean is the answer: each has its scatter.
 _FEWEST, _AVERAGED = 3, 3
 _HALF_WIDTH = 1.96  # of an interval that holds at 95 %, in standard errors
@@ -53,16 +55,29 @@ class Ensemble(NamedTuple):
     is_settled: bool
 
 
+Say = Callable[[Ensemble, float, int, float], None]
+"""Function of the best ensemble so far, and of the last one's sum of squares, motions, and motions ahead, about."""
+
+
 def size(columns: int) -> int:
     """Return the number of motions of an ensemble with so many unknowns of a window."""
     return max(_MOTIONS, _PER_NUMBER * columns)
 
 
+def algebra(dim: int, free: int, numbers: int) -> float:
+    """Return the seconds of an ensemble's regression of one window, measured on random numbers."""
+    rng, num, began = np.random.default_rng(0), size(dim + free), time.monotonic()
+    drawn, starts, residuals = rng.normal(size=(num, dim)), rng.normal(size=(num, 1, free)), np.ones((num, 1, numbers))
+    residuals *= rng.normal(size=(num, 1, 1))
+    Regression(drawn, starts, residuals).weighed(1.0)
+    return time.monotonic() - began
+
+
 def fit(
     motions: Motions, point: tuple[np.ndarray, np.ndarray], widths: tuple[np.ndarray, np.ndarray], box: Box,
-    noise: float, count: int, say: Callable[[Ensemble], None],
+    noise: float, count: int, say: Say,
 ) -> Ensemble:  # fmt: skip
-    """Return the ensemble whose mean motion fits best.
+    """Return the ensemble whose mean motion fits best: the first that settles, else the one with the least left.
 
     Args:
         motions: the simulation; motions that diverge have residuals that are not finite.
@@ -71,7 +86,7 @@ def fit(
         box: least and greatest values.
         noise: size of the noise in units of the residuals.
         count: number of measured numbers.
-        say: called with each ensemble.
+        say: called after each ensemble.
     """
     rng, dim, lowest = np.random.default_rng(0), len(point[0]), np.inf
     free = widths[1].shape[1]
@@ -80,9 +95,9 @@ def fit(
     num = fewest = size(dim + free)
     most = count * noise**2 * (1.0 + _EXCESS * np.sqrt(2.0 / count))
     ends: list[_Law] = []
-    index = 0
+    index, spent, best = 0, 0, None
     while True:
-        index += 1
+        index, spent, used = index + 1, spent + num, num
         drawn, starts = law.draw(num, rng, box)
         residuals = motions(drawn, starts)
         is_finite = np.isfinite(residuals).all(axis=(1, 2))
@@ -101,17 +116,27 @@ def fit(
         growth = float(np.sqrt(max(misfit / (count * noise**2), 1.0))) * noise
         before, kept = law, (_WIDER if has_missed else _NARROWER) * law.root
         law = _law(factors, middle + change, centres + moved, growth, kept, change)
-        stays = length < _SHORT * np.sqrt(dim) and bool((before.variances < _SETTLED**2 * law.variances).all())
+        is_narrow = bool((before.variances < _SETTLED**2 * law.variances).all())
+        # Where all but noise is explained, more ensembles would only narrow the intervals.
+        is_late = misfit <= most and spent >= EXPECTED * fewest
+        is_enough = is_late or (misfit <= most and bool((law.variances < _SURE**2).all()))
+        stays = length < _SHORT * np.sqrt(dim) and (is_narrow or is_enough)
         is_short = stays and not has_missed and index >= _FEWEST
         ends = [*ends, law] if is_short or ends else []
         found = _mean_of(ends or [law], factors, misfit, drawn)
-        is_last = found.is_settled or index == _MOST
+        # Of those that explain all but noise the last has the narrowest intervals.
+        if best is None or found.is_settled or found.squares <= max(best.squares, most):
+            best = found
+        is_settled = found.is_settled or (is_short and is_late)
+        is_last = is_settled or index == _MOST
         if is_last:
-            errors = _tried(model, motions, before.draw(num, rng, box), noise, chatter)
-            found = found._replace(factors=found.factors / max(1.0, float(np.quantile(errors, 0.95)) / _HALF_WIDTH))
-        say(found)
+            best = best._replace(is_settled=is_settled)
+            errors = _tried(model, motions, before.draw(used, rng, box), noise, chatter)
+            best = best._replace(factors=best.factors / max(1.0, float(np.quantile(errors, 0.95)) / _HALF_WIDTH))
+        ahead = num + max((_AVERAGED - len(ends)) * num, 0 if ends else EXPECTED * fewest - spent)
+        say(best, misfit, used, 0.0 if is_last else float(min(ahead, (_MOST - index + 1) * num)))
         if is_last:
-            return found
+            return best
 
 
 class _Law(NamedTuple):
@@ -183,18 +208,18 @@ class Regression:
         residuals: Float[np.ndarray, "motions windows numbers"],
     ):  # fmt: skip
         self._middle, self._count, self._width = drawn.mean(axis=0), len(drawn), 1 + drawn.shape[1] + free.shape[2]
-        self._parts: list[tuple[np.ndarray, np.ndarray]] = []
+        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for starts, one in zip(free.swapaxes(0, 1), residuals.swapaxes(0, 1), strict=True):
             away = np.column_stack([starts - starts.mean(axis=0), drawn - self._middle, np.ones(self._count)])
             columns = np.linalg.pinv(away) @ one
-            self._parts.append((columns, one - away @ columns))
+            left = one - away @ columns
+            self._parts.append((columns, left, left @ left.T))
 
     def _weighed(self, noise: float, chatter: float) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
         """Yield, by window, the product of all columns with others, weighed by the covariance of noise and chatter."""
         scale = max(self._count - self._width, 1) * noise**2 / chatter
-        for columns, left in self._parts:
+        for columns, left, gram in self._parts:
             # (σ² + e e'/n)⁻¹ = (1 - e (n σ² + e'e)⁻¹ e') / σ², in the space of motions, which are fewer than numbers.
-            gram = left @ left.T
             kept = np.linalg.solve(max(scale, 1e-12 * np.trace(gram)) * np.eye(self._count) + gram, left @ columns.T)
             yield lambda others, columns=columns, left=left, kept=kept: columns @ others - kept.T @ (left @ others)
 
@@ -204,7 +229,7 @@ class Regression:
         The covariance is that of noise and chatter, the latter by a factor.
         """
         found = []
-        for (columns, _), product in zip(self._parts, self._weighed(noise, chatter), strict=True):
+        for (columns, *_), product in zip(self._parts, self._weighed(noise, chatter), strict=True):
             gram = product(columns.T)
             sizes = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
             values, axes = np.linalg.eigh(gram / np.outer(sizes, sizes))
@@ -219,7 +244,7 @@ class Regression:
         """Return errors of the values that other motions would be given if they were recorded, in standard errors."""
         rng, dim = np.random.default_rng(1), drawn.shape[1]
         slope, seen = np.zeros((dim, dim)), np.zeros((dim, len(drawn)))
-        for (columns, _), product, one in zip(
+        for (columns, *_), product, one in zip(
             self._parts, self._weighed(noise, chatter), residuals.swapaxes(0, 1), strict=True
         ):
             free = len(columns) - dim - 1

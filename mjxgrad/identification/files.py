@@ -23,8 +23,8 @@ from mjxgrad.scene import Scene
 from mjxgrad.scene.scene import numbers_of
 
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
-_NAMED = ("mass", "damping", "armature", "friction_loss", "gear")
-KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "gains", "delay")
+_NAMED = ("mass", "damping", "armature", "friction_loss", "gear", "gains")
+KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "delay")
 """Kinds of parameters that `parameter` knows."""
 _Sizes = Mapping[str, float]  # of noise
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
@@ -73,9 +73,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
         return parameters.number(scene, field, *names, column=int(column) if column else None, bounds=bounds)
     if kind in _NAMED:
         return getattr(parameters, kind)(scene, *names, bounds=bounds)
-    if len(names) > 1 or (bounds is not None and kind == "inertia"):
-        raise ValueError(f"{kind} takes one name{', and no bounds' * (kind == 'inertia')}, got {text!r}")
-    return parameters.inertia(scene, *names) if kind == "inertia" else parameters.gains(scene, *names, bounds=bounds)
+    if len(names) > 1 or bounds is not None:
+        raise ValueError(f"inertia takes one name, and no bounds, got {text!r}")
+    return parameters.inertia(scene, *names)
 
 
 def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tuple[Recording, tuple[str, ...]]:

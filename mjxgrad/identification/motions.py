@@ -26,7 +26,7 @@ from mjxgrad.scene.numbers import with_numbers
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Contact, Discrete
 
-_AT_ONCE = 32  # values in one call: an interruption waits for it
+AT_ONCE = 32  # values in one call: an interruption waits for it
 _START = ("time", *MOTION)
 Signals = dict[str, Float[np.ndarray, "values windows times _"]]
 """Positions, velocities, activations and sensors by name, in each state."""
@@ -76,14 +76,15 @@ class Motions:
             starts: changes of the starts: positions and velocities in tangent space.
             steps: those that are simulated; later measurements do not count.
         """
-        found, index = [], np.minimum(windows.index, (steps or np.inf) - 1).astype(int)
-        counts = windows.index + windows.share <= (steps or np.inf)
+        last = steps or windows.controls.shape[1]
+        found, index = [], np.minimum(windows.index, last)  # a measurement at the last state has a share of 0
+        counts = windows.index + windows.share <= last
         place = np.arange(len(index))[:, None]
-        for begin in range(0, len(values), _AT_ONCE):
-            part, chunk = slice(begin, begin + _AT_ONCE), []
+        for begin in range(0, len(values), AT_ONCE):
+            part, chunk = slice(begin, begin + AT_ONCE), []
             signals = self.signals(windows, values[part], starts[part], steps)
             for name, measured in windows.measured.items():
-                before, after = signals[name][:, place, index], signals[name][:, place, index + 1]
+                before, after = signals[name][:, place, index], signals[name][:, place, np.minimum(index + 1, last)]
                 change = before + windows.share[..., None] * (after - before)
                 change = self._pool.layout.displacement(change, measured) if name == "qpos" else change - measured
                 with np.errstate(invalid="ignore"):
@@ -106,7 +107,7 @@ class Motions:
         if not self._engine.compiles:
             return self._by_mujoco(windows, values, starts, controls)
         dtype, count = self.scene.data.qpos.dtype, len(values)
-        pad = lambda x: jnp.asarray(np.pad(x, [(0, _AT_ONCE - count), *[(0, 0)] * (x.ndim - 1)], mode="edge"), dtype)  # noqa: E731
+        pad = lambda x: jnp.asarray(np.pad(x, [(0, AT_ONCE - count), *[(0, 0)] * (x.ndim - 1)], mode="edge"), dtype)  # noqa: E731
         names = tuple(name for name in windows.measured if name not in STATES)
         state = jax.tree.map(jnp.asarray, windows.state)
         found = self._run(
@@ -157,7 +158,7 @@ class Motions:
         names = tuple(self._programs["names"])
         if not names:
             return {}
-        padded = jnp.asarray(np.pad(values, ((0, _AT_ONCE - len(values)), (0, 0)), mode="edge"), first.dtype)
+        padded = jnp.asarray(np.pad(values, ((0, AT_ONCE - len(values)), (0, 0)), mode="edge"), first.dtype)
         found = self._run(("numbers", names), self._changed, padded, names=names)
         return {name: np.asarray(x, float)[: len(values)] for name, x in found.items()}
 

@@ -317,31 +317,41 @@ def number(scene: Scene, field: str, *names: str, column: int | None = None, bou
     return _positive(float(value[place][0]), bounds, write, "", field.removeprefix("dof_"), field in _POSITIVE)
 
 
-def gains(scene: Scene, actuator: str, *, bounds: tuple[Any, Any] | None = None) -> Parameter:
-    """Return the gains of an actuator: `kp` and `kv` of a position servo, `kv` of a velocity servo, the gain of a motor.
+def gains(scene: Scene, *actuators: str, bounds: tuple[Any, Any] | None = None) -> Parameter:
+    """Return the gains of an actuator, or the common ones of several of one kind.
 
-    Bounds are as in `mass`, each a number or one per gain.
+    They are `kp` and `kv` of a position servo, `kv` of a velocity servo, the gain of a motor. Bounds are as in `mass`, each a
+    number or one per gain.
 
     Raises:
         ValueError: if there is no such actuator, it is of another kind, or a gain is zero and no bounds are given.
     """
-    index = _indices(scene, _Object.mjOBJ_ACTUATOR, actuator)[0]
-    gain, bias = (np.asarray(getattr(scene.model, f"actuator_{name}"))[index] for name in ("gainprm", "biasprm"))
-    has_bias = scene.mj_model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
-    is_position, is_velocity = gain[0] == -bias[1] != 0, gain[0] == -bias[2] and bias[1] == 0
-    places = slice(1, 3) if is_position else slice(2, 3)  # of the bias, where the gains stand once more
-    if has_bias and not (is_position or is_velocity):
-        raise ValueError(
-            f"gains must be of a position or velocity servo or a motor, got {actuator} with bias {bias[:3]}"
-        )
+    indices = _indices(scene, _Object.mjOBJ_ACTUATOR, *actuators).tolist()
+    kinds = [_gains(scene, index, name) for index, name in zip(indices, actuators, strict=True)]
+    nominal, places = kinds[0]
+    for (_, other), name in zip(kinds, actuators, strict=True):
+        if other != places:
+            raise ValueError(f"gains must be of actuators of one kind, got {actuators[0]} and {name}")
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
-        index = index_of(model, _Object.mjOBJ_ACTUATOR, actuator)
+        index = np.array([index_of(model, _Object.mjOBJ_ACTUATOR, name) for name in actuators])
         value = jnp.atleast_1d(value)
         found = {"actuator_gainprm": model.actuator_gainprm.at[index, 0].set(value[0])}
-        return found | ({"actuator_biasprm": model.actuator_biasprm.at[index, places].set(-value)} if has_bias else {})
+        return found | ({"actuator_biasprm": model.actuator_biasprm.at[index, places].set(-value)} if places else {})
 
-    return _positive(-bias[places] if has_bias else gain[0], bounds, write, "", "gains")
+    return _positive(nominal, bounds, write, "", "gains")
+
+
+def _gains(scene: Scene, index: int, name: str) -> tuple[Float[np.ndarray, "..."], slice | None]:
+    """Return the gains of an actuator, and where its bias has them once more."""
+    gain, bias = (np.asarray(getattr(scene.model, f"actuator_{part}"))[index] for part in ("gainprm", "biasprm"))
+    if scene.mj_model.actuator_biastype[index] != mujoco.mjtBias.mjBIAS_AFFINE:
+        return np.asarray(gain[0], float), None
+    is_position, is_velocity = gain[0] == -bias[1] != 0, gain[0] == -bias[2] and bias[1] == 0
+    if not (is_position or is_velocity):
+        raise ValueError(f"gains must be of a position or velocity servo or a motor, got {name} with bias {bias[:3]}")
+    places = slice(1, 3) if is_position else slice(2, 3)
+    return -bias[places], places
 
 
 def _positive(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,8 @@ from mjxgrad.scene import Scene, SceneWarning, sensor
 
 STATES = ("qpos", "qvel", "act")
 _AROUND = 2  # rows on each side that tell a speed
+_FAR = 10.0  # times the noise by which a first row parts from an exact start that is told
+_TURN, _BEYOND = 2 * np.pi, 0.1  # rad, more than which may be degrees; share of its range by which a joint may leave it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +256,56 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
         return recording.start
     first = {name: recording.measured[name][0] for name in STATES if name in recording.measured and times[0] == 0}
     whole = {name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
-    return initial_state(scene, **whole)
+    with warnings.catch_warnings():
+        if in_degrees(scene, recording):  # which `doubts` tells in one sentence
+            warnings.simplefilter("ignore", SceneWarning)
+        return initial_state(scene, **whole)
+
+
+def doubts(scene: Scene, recording: Recording, free_start: bool | None) -> Iterator[str]:
+    """Yield sentences on what a recording is perhaps not: in radians; from the exact start that was given."""
+    model = scene.mj_model
+    if found := in_degrees(scene, recording):
+        name, (angle, low, high) = next(iter(found.items()))
+        others = f" (and {len(found) - 1} more)" * (len(found) > 1)
+        yield (
+            f"{name}{others} goes to {angle:.3g} rad, beyond its range from {low:.3g} to {high:.3g} rad: is it in degrees?"
+        )
+    if recording.start is None or free_start or _times(recording, float(scene.model.opt.timestep))[0] > 0:
+        return
+    apart = np.zeros((2, model.nv))
+    begins = {name: np.asarray(getattr(recording.start, name), float) for name in ("qpos", "qvel")}
+    rows = {name: recording.measured.get(name, begin[None])[0] for name, begin in begins.items()}
+    rows = {name: np.where(np.isfinite(row), row, begins[name]) for name, row in rows.items()}
+    mujoco.mj_differentiatePos(model, apart[0], 1.0, begins["qpos"], rows["qpos"])
+    apart[1] = rows["qvel"] - begins["qvel"]
+    apart = np.abs(apart) / [np.broadcast_to(recording.noise.get(name, 1.0), model.nv) for name in begins]
+    dof = int(apart.max(axis=0).argmax())
+    if apart[:, dof].max() > (_FAR if recording.knows_noise else 1.0):
+        unit = "noise" if recording.knows_noise else "variation"
+        what = f"{'speed' if apart[1, dof] > apart[0, dof] else 'place'} of {_joint_name(model, int(model.dof_jntid[dof]))}"
+        yield (
+            f"the first {what} is {apart[:, dof].max():.3g} times its {unit} beside the exact start that was given: "
+            "is it of another pose?"
+        )
+
+
+def in_degrees(scene: Scene, recording: Recording) -> dict[str, tuple[float, float, float]]:
+    """Return the farthest angle and the range of hinges that would stay within their ranges if angles were in degrees."""
+    model, found = scene.mj_model, {}
+    if "qpos" not in recording.measured or recording.measured["qpos"].shape[1] != model.nq:
+        return found
+    for joint in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited > 0)).tolist():
+        angles, (low, high) = recording.measured["qpos"][:, model.jnt_qposadr[joint]], model.jnt_range[joint]
+        angles, slack = angles[np.isfinite(angles)], _BEYOND * (high - low)
+        turned = np.radians(angles)
+        if np.abs(angles).max(initial=0.0) > _TURN and ((turned > low - slack) & (turned < high + slack)).all():
+            found[_joint_name(model, joint)] = float(angles[np.abs(angles).argmax()]), float(low), float(high)
+    return {name: one for name, one in found.items() if not one[1] <= one[0] <= one[2]}
+
+
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+    return model.joint(joint).name or f"joint {joint}"
 
 
 def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: float) -> np.ndarray:

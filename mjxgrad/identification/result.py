@@ -20,7 +20,7 @@ import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
-from mjxgrad._text import Printed, aligned, format_number, write
+from mjxgrad._text import Printed, aligned, duration, format_number, write
 from mjxgrad.identification.ensemble import MISFIT
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
@@ -57,6 +57,7 @@ class Outlook(Printed):
         coordinates: bounds and names.
         told: the fields of `statistics`: intervals for noise as stated and contacts that do not chatter.
         seconds: duration of a search, about.
+        more: seconds more, about, where that leaves more than noise: then other starts are compared.
         num_motions: motions of all windows that it takes, about.
         num_windows: windows, each of `num_steps` steps.
         num_steps: steps of a window.
@@ -65,6 +66,7 @@ class Outlook(Printed):
     coordinates: Coordinates
     told: dict[str, Any]
     seconds: float
+    more: float
     num_motions: int
     num_windows: int
     num_steps: int
@@ -84,7 +86,8 @@ class Outlook(Printed):
         """Say the price, and what the recordings tell at the nominal values."""
         count = self.num_windows
         windows = f"{count} recording{'s' * (count > 1)} of {self.num_steps} steps"
-        price = f"About {format_number(self.seconds)} s: {self.num_motions} motions of {windows}."
+        price = f"About {duration(self.seconds)}: {self.num_motions} motions of {windows}"
+        price += f"; {duration(self.more)} more where other starts must be compared."
         lost = [*self.told["without_effect"], *(" with ".join(one) for one in self.told["inseparable"])]
         told = (
             f"At the first values not told: {'; '.join(lost)}."
@@ -119,6 +122,7 @@ class Identification(Printed):
             mean, over the covariance of noise and chatter.
         num_numbers: number of measured numbers.
         num_steps: number of search steps.
+        share: share of the recordings over which the search had come, by time; below 1 where it was cut short.
         seconds: duration of the search.
         stopped: the reason why the search ended.
         scene: the scene with the identified values.
@@ -143,6 +147,7 @@ class Identification(Printed):
     num_motions: int
     num_numbers: int
     num_steps: int
+    share: float
     seconds: float
     stopped: Stopped
     scene: Scene
@@ -233,7 +238,12 @@ class Identification(Printed):
     def warnings(self) -> list[str]:
         """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""
         found = []
-        if self.has_noise and self._is_unexplained:
+        if self.is_measured and self.share < 1:
+            found.append(
+                f"The search stopped when it had used the first {100 * self.share:.0f} % of the recordings. The error is that "
+                "over the whole, of the best values visited. Give it more steps (--max-steps) or time."
+            )
+        elif self.has_noise and self._is_unexplained:
             free = "" if self.offsets is not None else "free_start=True (--start free), "
             found.append(
                 f"Residuals are {self.rms[1]:.3g} times the noise that was stated, beyond chance: the scene does not "

@@ -7,8 +7,10 @@ The unknown start of a window affects that window alone, so that one pair of mot
 Where the sum of squares is rugged at its least value, the values are those of an ensemble.
 """
 
+import contextlib
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,15 +18,15 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._arrays import function, instance, whole
-from mjxgrad.identification.ensemble import MISFIT, Ensemble, fit
+from mjxgrad.identification.ensemble import EXPECTED, MISFIT, Ensemble, algebra, fit
 from mjxgrad.identification.ensemble import size as ensemble_size
-from mjxgrad.identification.motions import Motions
+from mjxgrad.identification.motions import AT_ONCE, Motions
 from mjxgrad.identification.normal import factors_of, solved, split
 from mjxgrad.identification.parameters import Parameter, check_entries
-from mjxgrad.identification.recording import Recording, Windows, after_start, spread, stack
+from mjxgrad.identification.recording import Recording, Windows, after_start, doubts, spread, stack
 from mjxgrad.identification.result import Identification, Outlook, Stopped, exceeds_noise, statistics
 from mjxgrad.rollouts import DivergedError
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact
 
 Log = Callable[[int, dict[str, float]], None] | None
@@ -43,9 +45,12 @@ _EXACT = 1e-6  # of the first residuals: nothing is left
 _LEFT = 0.3  # of the first residuals, above which better values are sought where the noise is not known
 _SCATTERED, _BEST = 512, 3  # motions between the bounds, and those from which descents begin anew
 _ROUNDS = 32  # horizons over which they are chosen; with 16 one of five recordings of a turning box is lost
+_SAID = 8  # of these horizons, after one of which something is said
 _KEPT, _BESIDE = 8, 0.5  # of how many one is kept; how far beside these others are tried, in their spreads
 _SPREAD = 0.05  # of a coordinate, by which the first motions of an ensemble differ at least
-_DESCENT, _ENSEMBLES = 24, 7  # derivatives of whole motions, and ensembles, that a search takes, about
+_DESCENT = 8  # derivatives of whole motions that a descent takes, about
+_TIMED = 16  # motions from whose duration that of others is foretold
+_ALIKE = (0.1, 0.05)  # two ends: relative difference of their sums of squares, and that of coordinates
 _CORE = 0.3  # of the noise or of the first residuals, beyond which a residual of these counts by its logarithm
 
 
@@ -57,13 +62,14 @@ class Point(NamedTuple):
 
 
 class _End(NamedTuple):
-    """The end of a descent or of an ensemble: the point, factors of residuals and derivative there, and the sum of squares."""
+    """The end of a descent or of ensembles: the point, factors of residuals and derivative there, and the sum of squares."""
 
     point: Point
     factors: Float[np.ndarray, "windows rows columns"]
     squares: float
     residual: Float[np.ndarray, "windows numbers"] | None  # of a single motion
     many: Ensemble | None = None
+    stopped: Stopped = Stopped.CONVERGED
 
 
 def identify(
@@ -95,8 +101,10 @@ def identify(
         contact: as in `rollout`. None is MuJoCo's motion, by C MuJoCo, which recordings by MuJoCo need, for the intervals do
             not cover the error of another one. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of derivatives; motions of an ensemble are not counted.
-        log: called as `log(step, {"rms": ..., "share": ..., "seconds": ...})` after each derivative or ensemble, with the
-            share of the motions that was simulated, and the seconds that are left, about; step 0 is the nominal motion.
+        log: called as `log(step, {"rms": ..., "share": ..., "seconds": ..., "motions": ..., "start": ..., "starts": ...})`
+            after each derivative or ensemble; step 0 is the nominal motion. The share of the motions was simulated, and the
+            seconds are left, about. An rms is of one motion, or of the mean of many over the covariance of noise and chatter.
+            Where more than noise is left, 512 other starts are compared, and the descents from the best are numbered from 1.
 
     Returns:
         The values, their intervals, and undetermined parameters; `print(result.summary())`.
@@ -116,8 +124,10 @@ def identify(
     try:
         stopped = search.run(has_noise)
     except KeyboardInterrupt:
-        search.keep_latest()
         stopped = Stopped.INTERRUPTED
+    if stopped in (Stopped.INTERRUPTED, Stopped.STEPS):
+        with contextlib.suppress(KeyboardInterrupt):
+            search.keep_best()
     return _identified(search, stopped, held_out, has_noise)
 
 
@@ -144,11 +154,12 @@ def outlook(
     widths = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], 0.3)
     linear = search.linear(start.point, residual, widths, problem.num_steps, 1.0)
     factors = factors_of(residual, linear.slope, linear.by_start)
-    seconds, num = search.price(search.is_rugged(linear, start.point, 1.0))
+    num, more = search.price(search.is_rugged(linear, start.point, 1.0))
     coordinates = problem.motions.coordinates
     slope = _slope(problem, factors, coordinates.nominal)
     found = statistics(coordinates, coordinates.nominal, float(problem.num_numbers), slope, problem.num_numbers, 0)
-    return Outlook(coordinates, found, seconds, num, problem.windows.index.shape[0], problem.num_steps)
+    seconds = num * search.pace, more * search.pace
+    return Outlook(coordinates, found, *seconds, int(num), problem.windows.index.shape[0], problem.num_steps)
 
 
 def _checked(
@@ -182,6 +193,9 @@ class _Problem:
         self.free = np.flatnonzero(sizes.any(axis=0))
         self.sizes = sizes[:, self.free]
         self.windows = stack(motions.scene, recordings)
+        for one in recordings:
+            for text in doubts(motions.scene, one, free_start):
+                warnings.warn(f"{motions.scene.name}: in {one.name}, {text}", SceneWarning, stacklevel=2)
         self.count, self.num_steps = len(motions.coordinates.names), self.windows.controls.shape[1]
         self.num_numbers = num_numbers(self.windows)
         if not self.num_numbers:
@@ -205,44 +219,105 @@ class _Search:
 
     def __init__(self, problem: _Problem, max_steps: int, log: Log):
         self.problem, self._most, self._log = problem, max_steps, log
-        self.num_steps, self._begun, self._foretold = 0, time.monotonic(), 0.0
+        self.num_steps, self._begun = 0, time.monotonic()
+        self.share = 0.0  # of the recordings over which derivatives were taken
         self._rounding = float(np.finfo(problem.motions.scene.data.qpos.dtype).eps) ** 0.75
         self._to_go = 0.0  # of the last descent, standard errors squared
-        self._latest: tuple[Point, np.ndarray] | None = None
-        self._pace = math.inf  # s of a motion of all windows
+        self._early: list[Point] = []  # visited over a part of the recordings
+        self._ahead, self._later = 0.0, 0.0  # motions that this part of the search takes, about, and those after it
+        self._start, self._starts = 0, 1  # which of how many other starts
         start = Point(np.zeros(problem.count), np.zeros(problem.sizes.shape))
-        problem.residuals([start] * 2, problem.num_steps)  # compiles
+        problem.residuals([start], problem.num_steps)  # compiles
+        self._fixed = 0.0  # what a motion of no steps takes, in whole motions
         began = time.monotonic()
-        residual = problem.residuals([start] * 2, problem.num_steps)[0]
-        self._pace = (time.monotonic() - began) / 2
+        residual = problem.residuals([start] * _TIMED, problem.num_steps)[0]
+        whole = time.monotonic() - began
+        self.pace = whole / self._work(_TIMED, problem.num_steps)
+        if not problem.motions.compiles and problem.num_steps > 1:
+            problem.residuals([start] * _TIMED, 1)
+            self._fixed = min((time.monotonic() - began) / whole - 1.0, 1.0)
         if not np.isfinite(residual).all():
             raise DivergedError(
                 "nominal values must give motions that stay finite, got one that diverged: begin elsewhere"
             )
         self.first = math.sqrt((residual**2).sum() / problem.num_numbers)
         nothing = np.zeros((*residual.shape, problem.count)), np.zeros((*residual.shape, problem.sizes.shape[1]))
-        self.end = _End(start, factors_of(residual, *nothing), float((residual**2).sum()), residual)
+        self._none = factors_of(residual, *nothing)  # where no derivative was taken
+        self.end = _End(start, self._none, float((residual**2).sum()), residual)
+        self._single = self.end  # the best of a descent
 
-    def price(self, is_rugged: bool) -> tuple[float, int]:
-        """Return the seconds that a search takes, about, and its motions of all windows."""
-        columns = self.problem.count + self.problem.sizes.shape[1]
-        num = _DESCENT * 2 * columns + is_rugged * _ENSEMBLES * ensemble_size(columns)
-        return num * self._pace, int(num)
+    def residuals(self, points: Sequence[Point], steps: int) -> Float[np.ndarray, "points windows numbers"]:
+        """Return residuals over so many steps, and see how long a motion takes."""
+        began = time.monotonic()
+        found = self.problem.residuals(points, steps)
+        if len(points) >= _TIMED:
+            self.pace = (self.pace + (time.monotonic() - began) / self._work(len(points), steps)) / 2
+        return found
+
+    def _work(self, num: int, steps: int) -> float:
+        """Return the price of simulations in motions of all windows; a compiled program always makes as many at once."""
+        num = -(-num // AT_ONCE) * AT_ONCE if self.problem.motions.compiles else num
+        return num * (self._fixed + (1.0 - self._fixed) * steps / self.problem.num_steps)
+
+    def _derivative(self, steps: int) -> float:
+        return self._work(2 * (self.problem.count + self.problem.sizes.shape[1]), steps)
+
+    def _horizons(self) -> list[int]:
+        """Return the numbers of steps over which other starts are compared."""
+        shares = _HORIZONS if self.problem.motions.compiles else np.geomspace(_HORIZONS[0], 1.0, _ROUNDS)
+        return sorted({max(round(share * self.problem.num_steps), 1) for share in shares})
+
+    def price(self, is_rugged: bool) -> tuple[float, float]:
+        """Return the motions of all windows that a search takes, about, and those of other starts."""
+        problem, columns = self.problem, (self.problem.count, self.problem.sizes.shape[1])
+        descent, many = _DESCENT * self._derivative(problem.num_steps), 0.0
+        if is_rugged:
+            numbers = problem.num_numbers // len(problem.sizes)
+            many = self._work(ensemble_size(sum(columns)), problem.num_steps)
+            many = EXPECTED * (many + len(problem.sizes) * algebra(*columns, numbers) / self.pace)
+        return descent + many, self._comparison() + descent
+
+    def _comparison(self) -> float:
+        return sum(self._work(_SCATTERED, steps) for steps in self._horizons())
+
+    def _after(self, noise: float | None) -> float:
+        """Return the motions of other starts if they are to be tried, by what is left now."""
+        return self.price(False)[1] if not self._start and self._is_off(noise) else 0.0
 
     def run(self, has_noise: bool) -> Stopped:
         """Return why the search ended."""
-        noise = 1.0 if has_noise else None
-        self._foretold = self.price(bool(self.problem.motions.scene.pairs))[0]
+        noise, whole = 1.0 if has_noise else None, self._derivative(self.problem.num_steps)
+        self._ahead = _DESCENT * whole
+        self._later = self.price(bool(self.problem.motions.scene.pairs))[0] - self._ahead
         self._say(self.first)
         stopped, is_rugged = self._descend(self.end.point, noise)
-        if is_rugged and stopped is not Stopped.STEPS:
-            stopped = self._average(self.noise(noise))
-        if stopped is not Stopped.STEPS and self._is_off(noise):
-            for point in self._scattered(noise):
-                stopped, is_rugged = self._descend(point, noise)
-            if is_rugged and stopped is not Stopped.STEPS:
-                stopped = self._average(self.noise(noise))
-        return stopped
+        if stopped is Stopped.STEPS:
+            return stopped
+        if is_rugged:
+            self._average(self._single, self.noise(noise))
+        if not self._is_off(noise) and self.end.stopped is not Stopped.STALLED:
+            return self.end.stopped
+        ends, is_rugged = [self._single], False
+        for point in self._scattered(noise):
+            stopped, is_other_rugged = self._descend(point, noise)
+            if stopped is Stopped.STEPS:
+                return stopped
+            if any(self._is_alike(self._single, one) for one in ends):
+                break
+            if self._single.squares < min(one.squares for one in ends):
+                is_rugged = is_other_rugged
+            ends.append(self._single)
+        # Ensembles begin anew where another start has led to a better motion than the first, or where they did not settle.
+        if is_rugged or self.end.stopped is Stopped.STALLED:
+            best = min(ends, key=lambda one: one.squares)
+            self._average(best if is_rugged else self.end, self.noise(noise))
+        return self.end.stopped
+
+    def _is_alike(self, one: _End, other: _End) -> bool:
+        """Return whether two descents ended as well and beside one another, so that further starts will, too."""
+        close, beside = _ALIKE
+        apart = np.abs(one.point.values - other.point.values).max()
+        return bool(abs(one.squares - other.squares) < close * other.squares and apart < beside)
 
     def noise(self, known: float | None) -> float:
         """Return the size of the noise: as stated, else what is left, of which some may be chatter."""
@@ -253,22 +328,31 @@ class _Search:
         """Return the seconds since the search began."""
         return time.monotonic() - self._begun
 
-    def _say(self, rms: float, share: float = 1.0) -> None:
+    def _say(self, rms: float, share: float = 1.0, motions: int = 1, starts: int | None = None) -> None:
         if self._log is not None:
-            left = max(self._foretold - self.seconds, 0.0)
-            self._log(self.num_steps, {"rms": rms, "share": share, "seconds": left})
+            left = self.pace * (max(self._ahead, self._derivative(self.problem.num_steps)) + self._later)
+            told = {"motions": motions, "start": self._start, "starts": starts or self._starts}
+            self._log(self.num_steps, {"rms": rms, "share": share, "seconds": left, **told})
 
-    def keep_latest(self) -> None:
-        """Keep the latest point of a horizon that is still growing, where its whole motion is better."""
-        if self._latest is not None and self.end.many is None:
-            point, factors = self._latest
-            residual = self.problem.residuals([point], self.problem.num_steps)[0]
-            if (total := float((residual**2).sum())) <= self.end.squares:
-                self.end = _End(point, factors, total, residual)
+    def keep_best(self) -> None:
+        """Keep the point whose whole motion is best of all that were visited, with the derivative there."""
+        steps, best = self.problem.num_steps, self.end
+        if self._early:
+            found = self.problem.residuals(self._early, steps)
+            squares = (found**2).sum(axis=(1, 2))
+            i = int(squares.argmin())
+            if squares[i] < best.squares:
+                best = _End(self._early[i], self._none, float(squares[i]), found[i])
+        if best.factors is self._none and best.residual is not None and self.num_steps:
+            first = np.full(self.problem.count, _FIRST), np.full(self.problem.sizes.shape[1], _FIRST)
+            linear = self.linear(best.point, best.residual, first, steps, 1.0)
+            self.end = best._replace(factors=factors_of(best.residual, linear.slope, linear.by_start))
 
     def _descend(self, point: Point, noise: float | None) -> tuple[Stopped, bool]:
         """Minimise the residuals from a point over horizons that grow; return why it ended and whether the end is rugged."""
         problem = self.problem
+        self._single = self.end._replace(squares=np.inf)
+        self._ahead = _DESCENT * self._derivative(problem.num_steps)
         widths: tuple[np.ndarray, np.ndarray] | None = None
         needed = 2 * (problem.count + problem.sizes.shape[1])
         horizons = [max(round(share * problem.num_steps), 1) for share in _HORIZONS]
@@ -282,6 +366,7 @@ class _Search:
             return stopped, False
         if self.is_rugged(linear, point, self.noise(noise)):
             return stopped, True
+        self._later = self._after(noise)  # no ensembles
         stopped, point, linear, _ = self._minimise(point, widths, horizons[-1], is_last=True)
         # Beside a jump no step is better, though derivatives foretell one.
         is_beside = self._to_go > 1.0 and not self._is_exact(math.sqrt(self.end.squares))
@@ -297,7 +382,7 @@ class _Search:
         """Go down by Levenberg and Marquardt's steps over so many time steps."""
         problem, is_whole = self.problem, steps == self.problem.num_steps
         numbers = problem.num_numbers if is_whole else max(int(self._counts(steps)), 1)
-        residual: np.ndarray = problem.residuals([point], steps)[0]
+        residual: np.ndarray = self.residuals([point], steps)[0]
         first = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], _FIRST)
         near: tuple[np.ndarray, np.ndarray] = widths if widths is not None else first
         share = _NARROW / math.sqrt(numbers) if is_last else _WIDE
@@ -309,9 +394,13 @@ class _Search:
             linear = self.linear(point, residual, near, steps, share)
             near = linear.widths
             factors = factors_of(residual, linear.slope, linear.by_start)
-            if is_whole and total <= self.end.squares:
-                self.end = _End(point, factors, total, residual)
-            self._latest, self.num_steps = (point, factors), self.num_steps + 1
+            if is_whole:
+                here = _End(point, factors, total, residual)
+                self._single, self.end = (here if total <= one.squares else one for one in (self._single, self.end))
+            else:
+                self._early.append(point)
+            self.share = max(self.share, steps / problem.num_steps)
+            self.num_steps, self._ahead = self.num_steps + 1, self._ahead - self._derivative(steps)
             self._say(math.sqrt(total / numbers), steps / problem.num_steps)
             room = box[0] - point.values, box[1] - point.values
             if self.num_steps >= self._most:
@@ -327,7 +416,7 @@ class _Search:
                 longest = np.abs(step.values).max(initial=0.0)
                 shorter = min(1.0, _LONGEST / max(longest, 1e-300))
                 trial = Point(np.clip(point.values + shorter * step.values, *box), point.starts + shorter * step.starts)
-                after = problem.residuals([trial], steps)[0]
+                after = self.residuals([trial], steps)[0]
                 is_better = bool(np.isfinite(after).all()) and float((after**2).sum()) < total
                 damping *= _EASED if is_better else _RAISED
                 if is_better or damping > _DAMPED[1] or trials >= _TRIALS[is_whole]:
@@ -356,10 +445,7 @@ class _Search:
                     points.append(Point(*parts))
         box = problem.motions.coordinates.box()
         points = [Point(np.clip(values, *box), starts) for values, starts in points]
-        began = time.monotonic()
-        found = problem.residuals(points, steps) if points else np.zeros((0, *residual.shape))
-        if steps == problem.num_steps and points:
-            self._pace = (time.monotonic() - began) / len(points)
+        found = self.residuals(points, steps) if points else np.zeros((0, *residual.shape))
         is_finite, count = np.isfinite(found).all(axis=(1, 2)), problem.count
         found[~is_finite] = residual
         for i in np.flatnonzero(~is_finite):
@@ -426,40 +512,51 @@ class _Search:
     def _scattered(self, noise: float | None) -> Iterator[Point]:
         """Yield the points whose motions fit best, most of their course, of many between the bounds and beside the best."""
         # What fits a first part is where to look for what fits more of it: chaos hides the rest at first.
-        problem, rng, motions = self.problem, np.random.default_rng(1), self.problem.motions
-        low, high = motions.coordinates.box()
+        problem, rng, horizons = self.problem, np.random.default_rng(1), self._horizons()
+        low, high = problem.motions.coordinates.box()
         low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
         values = rng.uniform(low, high, (_SCATTERED, problem.count))
         starts = np.zeros((_SCATTERED, *problem.sizes.shape)) + self.end.point.starts
-        shares = _HORIZONS if motions.compiles else np.geomspace(_HORIZONS[0], 1.0, _ROUNDS)
-        horizons = sorted({max(round(share * problem.num_steps), 1) for share in shares})
+        self._ahead = self._comparison()
+        self._later = _DESCENT * self._derivative(problem.num_steps)
         for i, steps in enumerate(horizons, start=1):
-            found = problem.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], steps)
+            found = self.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], steps)
+            self._ahead -= self._work(_SCATTERED, steps)
             losses = np.log1p((found / (_CORE * (noise or self.first))) ** 2).sum(axis=(1, 2))
             order = np.argsort(np.where(np.isfinite(losses), losses, np.inf))
             best = values[order[: _SCATTERED // _KEPT]]
+            if i % _SAID == 1 or i == len(horizons):
+                rms = float(np.linalg.norm(found[order[0]])) / math.sqrt(max(self._counts(steps), 1))
+                self._say(rms, steps / problem.num_steps, starts=_SCATTERED)
             if i == len(horizons):
+                chosen: list[int] = []  # of those beside one another the better one
                 for one in order[:_BEST]:
-                    if np.isfinite(losses[one]):
-                        yield Point(values[one], starts[one])
+                    is_apart = all(np.abs(values[one] - values[other]).max() > _ALIKE[1] for other in chosen)
+                    chosen += [one] if np.isfinite(losses[one]) and is_apart else []
+                self._starts, self._later = len(chosen), 0.0
+                for self._start, one in enumerate(chosen, start=1):
+                    yield Point(values[one], starts[one])
                 return
             beside = best[rng.integers(len(best), size=_SCATTERED - len(best))]
             beside = beside + _BESIDE * best.std(axis=0) * rng.normal(size=beside.shape)
             values = np.concatenate([best, np.clip(beside, low, high)])
 
-    def _average(self, noise: float) -> Stopped:
-        """Fit the mean of many motions, from the best end, and keep it unless that explains nothing more."""
-        problem, alone = self.problem, self.end
+    def _average(self, alone: _End, noise: float) -> None:
+        """Fit the mean of many motions, from the end of a descent, and keep it unless that explains nothing more."""
+        problem, before, began = self.problem, self.end, time.monotonic()
 
-        def say(found: Ensemble) -> None:
-            self.num_steps += 1
-            if found.squares < self.end.squares or self.end.many is not None:
-                point = Point(found.values, found.starts)
-                self.end = _End(point, found.factors, found.squares, None, found)
-            self._say(math.sqrt(found.squares / problem.num_numbers))
+        def say(best: Ensemble, squares: float, motions: int, ahead: float) -> None:
+            nonlocal began
+            pace, began = (time.monotonic() - began) / motions, time.monotonic()
+            self.num_steps, self._ahead = self.num_steps + 1, ahead * pace / self.pace
+            if best.squares < before.squares:
+                stopped = Stopped.CONVERGED if best.is_settled else Stopped.STALLED
+                self.end = _End(Point(best.values, best.starts), best.factors, best.squares, None, best, stopped)
+            self._later = self._after(noise)
+            self._say(math.sqrt(squares / problem.num_numbers), motions=motions)
 
         def run(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
-            return problem.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], problem.num_steps)
+            return self.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], problem.num_steps)
 
         by_start, _, slope, _ = split(alone.factors, problem.count)
         excess = max(math.sqrt(alone.squares / problem.num_numbers), noise)
@@ -468,10 +565,9 @@ class _Search:
         own = own if problem.free_start else np.full(problem.sizes.shape, noise)
         box = problem.motions.coordinates.box()
         try:
-            found = fit(run, alone.point, (np.minimum(widths, _WIDEST), own), box, noise, problem.num_numbers, say)
+            fit(run, alone.point, (np.minimum(widths, _WIDEST), own), box, noise, problem.num_numbers, say)
         except DivergedError:
-            return Stopped.STALLED
-        return Stopped.CONVERGED if found.is_settled or self.end.many is None else Stopped.STALLED
+            self.end = self.end._replace(stopped=Stopped.STALLED) if self.end is before else self.end
 
 
 class _Linear(NamedTuple):
@@ -516,6 +612,7 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
         num_motions=1 if end.many is None else len(end.many.drawn),
         num_numbers=numbers,
         num_steps=search.num_steps,
+        share=search.share,
         seconds=search.seconds,
         stopped=stopped,
         scene=motions.put(values),

@@ -265,7 +265,8 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
     for name in halves:
         table[f"{name}_variance"] = np.array([[4.0], [1e5], [4.0]])
     assert swept.headline == (
-        "From 16 rollouts no estimate is within 1000 % of the gradient: take softer contact, a shorter time step or a shorter horizon."
+        "From 16 rollouts no estimate is within 1000 % of the gradient: "
+        "take softer contact, a shorter time step or a shorter horizon."
     )
     assert swept.best() == ["first", "none", "zeroth"]
     table |= {name: np.zeros((3, 1)) for name in table if name.endswith("_bias") or name == "truth"}

@@ -38,7 +38,7 @@ def test_values_and_covariance_are_those_of_generalised_least_squares(chatter):
     motions, slope, recorded, by_start, noise = _problem(1.0, chatter, np.random.default_rng(0))
     point = np.zeros(2), np.zeros((_WINDOWS, 3))
     found = fit(
-        motions, point, (np.ones(2), np.ones((_WINDOWS, 3))), (-np.ones(2), np.ones(2)), 1.0, 126, lambda _: None
+        motions, point, (np.ones(2), np.ones((_WINDOWS, 3))), (-np.ones(2), np.ones(2)), 1.0, 126, lambda *_: None
     )
     # The starts are unknown: what they explain tells nothing of the values.
     weights = np.linalg.inv(noise)
@@ -74,10 +74,27 @@ def test_motions_that_diverge_do_not_count_unless_most_do():
         return np.where(np.arange(len(values))[:, None, None] % 10 < share, np.inf, motions(values, starts))
 
     given = (np.zeros(2), np.zeros((_WINDOWS, 3))), (np.ones(2), np.ones((_WINDOWS, 3))), (-np.ones(2), np.ones(2))
-    found = fit(functools.partial(diverging, 3), *given, 1.0, 120, lambda _: None)
+    found = fit(functools.partial(diverging, 3), *given, 1.0, 120, lambda *_: None)
     np.testing.assert_allclose(found.values, _TRUE, atol=0.1)
     with pytest.raises(mg.DivergedError, match="about the best values, got few"):
-        fit(functools.partial(diverging, 10), *given, 1.0, 120, lambda _: None)
+        fit(functools.partial(diverging, 10), *given, 1.0, 120, lambda *_: None)
+
+
+def test_the_best_of_ensembles_that_do_not_settle_is_returned():
+    """Motions part from the recording ever more, as where an ensemble has missed: the second of them is the best."""
+    away, told = iter([40.0, 20.0]), []
+    linear, *_ = _problem(1.0, 0.0, np.random.default_rng(0))
+    apart = np.random.default_rng(1).normal(size=(_WINDOWS, _NUMBERS))
+
+    def motions(values, starts):
+        return linear(values, starts) + next(away, 80.0) * apart
+
+    given = (np.zeros(2), np.zeros((_WINDOWS, 3))), (np.ones(2), np.ones((_WINDOWS, 3))), (-np.ones(2), np.ones(2))
+    found = fit(motions, *given, 1.0, 120, lambda best, squares, num, ahead: told.append((best, squares, ahead)))
+    assert not found.is_settled
+    assert found.squares == min(squares for _, squares, _ in told) == told[1][1] < told[-1][1]
+    assert all(best.squares == min(squares for _, squares, _ in told[: i + 1]) for i, (best, *_) in enumerate(told))
+    assert min(ahead for *_, ahead in told[:-1]) > 0
 
 
 def test_the_start_is_as_noisy_as_the_first_row_that_gives_it():

@@ -227,6 +227,30 @@ def test_the_command_finds_a_mass_and_writes_what_it_found(tmp_path, monkeypatch
     assert "time of late.csv must be in seconds" in capsys.readouterr().err
 
 
+def test_the_command_begins_at_a_key_frame_and_says_what_it_replaces(tmp_path, monkeypatch, capsys):
+    """A cart of 3 kg from 1 m at 0.5 m/s; the recording has no speeds, so that the first row alone would say that it rests."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli.signal, "signal", lambda *_: None)
+    keys = '</actuator><keyframe><key name="there" qpos="1" qvel=".5"/></keyframe>'
+    Path("cart.xml").write_text(_CART.replace(' damping=".1"', "").replace("</actuator>", keys))
+    drive = np.sin(np.arange(40) / 5)
+    speed = 0.5 + np.concatenate([[0], np.cumsum(0.01 * 3 * drive / 3)])
+    place = 1 + np.concatenate([[0], np.cumsum(0.01 * speed[1:])])
+    _write("motion.csv", **{"time": 0.01 * np.arange(40), "x": place[:40], "motor": drive})
+    command = ["identify", "cart.xml", "motion.csv", "--parameter", "mass:cart", "--noise", "x=1e-5", "--start"]
+    assert cli.main([*command, "ther"]) == 2
+    assert "--start must be noisy, exact, free or a key frame (there), got ther" in capsys.readouterr().err
+    assert cli.main([*command, "there"]) == 0
+    assert "replaces the results" not in capsys.readouterr().err
+    assert mujoco.MjModel.from_xml_path("identified/identified.xml").body("cart").mass == pytest.approx(3.0, rel=1e-4)
+    with pytest.warns(
+        mg.scene.SceneWarning, match="in motion.csv, the first place of x is 1e[+]05 times its noise beside"
+    ):
+        assert cli.main([*command, "exact"]) == 1
+    said = capsys.readouterr().err
+    assert said.index("replaces the results in identified") < said.index("About ")
+
+
 def test_figures_name_their_signals_as_columns_do(scene):
     names = files.column_names(scene)
     assert [names["qpos", 2], names["qpos", 7], names["qvel", 6]] == ["qpos:root[2]", "qpos:x", "qvel:x"]

@@ -1,6 +1,7 @@
 """Parameters come back from motions that were made with them, as surely as the noise allows."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +51,66 @@ def test_an_interrupted_search_returns_the_best_values_so_far(cart):
     assert result.num_steps == 1
     assert np.isfinite(result.half_width["gear"])
     assert result.headline.startswith("Interrupted, best so far: error")
+
+
+def test_over_a_part_of_a_recording_the_motion_at_its_last_state_is_compared_with_that_state(cart):
+    """The course's own residuals are zero over any number of steps."""
+    window = stack(cart, [Recording({"place": _course()}, _DRIVE[:, None])])
+    motions = Motions(cart, {"none": Parameter(1.0)}, delay=None, contact=None)
+    for steps in (1, 5, _STEPS):
+        left = motions.residuals(window, np.ones((1, 1)), np.zeros((1, 1, 2)), steps)
+        np.testing.assert_allclose(left, 0.0, atol=1e-6)
+
+
+def test_a_search_that_is_cut_short_keeps_the_best_of_the_whole_and_claims_nothing_of_the_rest(cart):
+    """Places go with the gear, so that the first eighth of the course tells it but for damping of a step by 1/101.
+
+    Where that eighth is of another gear, its values are not kept.
+    """
+    recording = Recording({"place": _course(gear=3.3)}, _DRIVE[:, None], noise={"place": 0.001})
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], max_steps=2)
+    assert result.stopped is Stopped.STEPS
+    np.testing.assert_allclose(result.values["gear"], 3.3, rtol=0.01)
+    assert result.rms[1] < 0.1 * result.rms[0]
+    assert np.isfinite(result.half_width["gear"])
+    assert "stopped when it had used the first 12 % of the recordings" in result.summary()
+    assert "Without effect" not in result.summary()
+    bent = _course(gear=3.3)
+    bent[:6] = _course(gear=9.0)[:6]
+    recording = Recording({"place": bent}, _DRIVE[:, None], noise={"place": 0.001})
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [recording], max_steps=2)
+    np.testing.assert_allclose(result.values["gear"], 3.0)
+    assert result.rms[1] == result.rms[0]
+
+
+def test_a_search_says_what_it_does_until_it_ends_and_no_further_start_follows_one_that_ends_alike(cart):
+    """A parabola has one minimum, and ten times the noise that was stated is left there."""
+    told = []
+    gear = {"gear": identification.gear(cart, "motor")}
+    mg.identify(cart, gear, [_noisy()], log=lambda step, metrics: told.append(metrics))
+    assert all(one["seconds"] > 0 for one in told)
+    assert {(one["start"], one["starts"]) for one in told} == {(0, 1), (0, 512), (1, 1)}
+    assert identification.outlook(cart, gear, [_noisy()]).more > 0
+
+
+def test_a_first_row_far_from_an_exact_start_and_angles_in_degrees_are_told():
+    """On a hinge from -1 to 1 rad, 57.3 times its angle fits as degrees. The start is 200 times the noise off."""
+    scene = mg.load_scene("""<mujoco><worldbody><body><joint name="hip" axis="0 1 0" range="-57 57"/><geom size=".1"/></body>
+        </worldbody></mujoco>""")
+    turn = 0.2 + 0.3 * np.sin(np.arange(20) / 5)
+    damping = {"damping": identification.damping(scene, "hip", bounds=(0.0, 1.0))}
+    for factor, start, said in (
+        (1.0, mg.initial_state(scene), "the first place of hip is 200 times its noise beside the exact start"),
+        (57.3, None, "hip goes to 28.6 rad, beyond its range from -0.995 to 0.995 rad: is it in degrees?"),
+        (1.0, None, None),
+    ):
+        one = Recording({"qpos": factor * turn}, times=0.002 * np.arange(20), noise={"qpos": 0.001}, start=start)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            identification.outlook(scene, damping, [one])
+        texts = [str(one.message) for one in told if "undamped" not in str(one.message)]
+        assert len(texts) == (said is not None)
+        assert all(said in text for text in texts)
 
 
 @pytest.mark.parametrize(

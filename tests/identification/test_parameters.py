@@ -9,6 +9,7 @@ import pytest
 import mjxgrad as mg
 from mjxgrad import identification
 from mjxgrad.bodies.spatial import rotation_matrix
+from mjxgrad.identification import files
 from mjxgrad.identification.parameters import (
     Coordinates,
     Parameter,
@@ -113,6 +114,21 @@ def test_the_gain_of_an_actuator_that_is_no_position_servo_is_where_the_file_has
     expected = mujoco.MjModel.from_xml_string(asked)
     np.testing.assert_allclose(found.actuator_gainprm, expected.actuator_gainprm)
     np.testing.assert_allclose(found.actuator_biasprm, expected.actuator_biasprm)
+
+
+def test_gains_of_several_actuators_are_common_and_of_one_kind():
+    scene = mg.load_scene("""<mujoco><worldbody><body><joint name="j"/><geom size=".1" pos=".1 0 0"/></body></worldbody><actuator>
+        <position name="a" joint="j" kp="3" kv="1"/><motor name="b" joint="j"/><position name="c" joint="j" kp="4" kv="2"/>
+        </actuator></mujoco>""")
+    parameter = files.parameter(scene, "gains:a,c")
+    np.testing.assert_allclose(parameter.nominal, [3.0, 1.0])
+    found = parameter.write(scene.model, jnp.array([5.0, 6.0]))
+    np.testing.assert_allclose(found["actuator_gainprm"][:, 0], [5, 1, 5])
+    np.testing.assert_allclose(found["actuator_biasprm"][:, 1:3], [[-5, -6], [0, 0], [-5, -6]])
+    with pytest.raises(ValueError, match="gains must be of actuators of one kind, got a and b"):
+        identification.gains(scene, "a", "b")
+    with pytest.raises(ValueError, match="inertia takes one name"):
+        files.parameter(scene, "inertia:world,other")
 
 
 def test_gains_of_what_is_no_servo_are_refused():
