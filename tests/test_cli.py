@@ -227,7 +227,7 @@ def test_a_signal_within_a_long_computation_ends_the_process_within_a_second_or_
         "sweep",
         "scene.xml",
         "--samples",
-        "4000",
+        "800",
         "--horizon",
         "50",
         "--engine",
