@@ -295,7 +295,7 @@ class Sweep(Paged):
         head, *rows = [row[:-1] for row in self._rows()]
         columns = list(self.errors())
         mark = frozenset((i, 1 + columns.index(name)) for i, name in enumerate(self.best()) if name in columns)
-        table = Block(table=Table(head, rows, f"{_ERRORS} The least is bold.", mark))
+        table = Block(table=Table(head, rows, f"{_ERRORS} Bold is what to take.", mark))
         details = Block(folded="Bias and variance in numbers", code=self.result.summary(self.labels))
         blocks = [table, Block(drawings=parts, caption=told), Block(text=self.question), details]
         answer, _, more = self.headline.partition(". ")
