@@ -270,12 +270,12 @@ class Sweep(Paged):
         others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
         answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient."
         answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}."
-        others = []
-        for label, other, is_off in zip(self.labels, best, map(bool, self.result.too_stiff), strict=True):
-            if self.labels.index(label) > row and not is_off and other != taken:
-                others.append(f"rom {label} 1/s² on {_NAMES[other]}")
+        later = []
+        for label, other, is_off in list(zip(self.labels, best, self.result.too_stiff, strict=True))[row + 1 :]:
+            if not is_off and other != taken:
+                later.append(f"from {label} 1/s² on {_NAMES[other]}")
                 taken = other
-        return f"{answer} F{', f'.join(others)}." if others else answer
+        return f"{answer} F{', '.join(later)[1:]}." if later else answer
 
     def __str__(self) -> str:
         errors = "\n".join([_ERRORS, *aligned(self._rows(), str.ljust)])
@@ -350,11 +350,8 @@ def sweep(
         whole("num_samples", num_samples, 2)
     function("log", log, "text")
     say, began, last = log or (lambda _: None), [], [0]
-    quick = (
-        QUICK
-        if device.is_cpu() and isinstance(task_settings.get("contact", Slope()), Slope | Discrete | None)
-        else None
-    )
+    is_own = isinstance(task_settings.get("contact"), Slope | Discrete | None)
+    quick = QUICK if is_own and device.is_cpu() else None
     scene = source if isinstance(source, Scene) else load_scene(source, engine=engine or quick)
     scene = scene if engine is None else scene.with_engine(engine)
     if task_settings.get("start") is None and scene.mj_model.nkey:
