@@ -264,8 +264,8 @@ def measured_one(part: str, path: str) -> dict[str, Any]:
             return {"nv": mujoco.MjModel.from_xml_path(path).nv}
         except ValueError as error:
             return {"nv": 0, "why": " ".join(str(error).split())[:200]}
-    begin, engine = time.perf_counter(), {"m": "mjx", "w": "warp", "c": "mujoco"}[part[0]]
-    model = load(path, newton=part[0] in "mw")
+    begin, engine = time.perf_counter(), {"mjx": "mjx", "warp": "warp"}.get(part.partition("_")[0], "mujoco")
+    model = load(path, newton=engine != "mujoco")
     if engine == "warp":
         return _by_warp(model)
     with warnings.catch_warnings(record=True) as told:
