@@ -38,7 +38,10 @@ def set_const(model: mjx.Model) -> mjx.Model:
 def constants_of(model: mjx.Model) -> dict[str, Array]:
     """Return the constants of `set_const` by name."""
     with jax.default_matmul_precision("highest"):
-        data = kinematics.up_to_inertia(model, mjx.make_data(model).replace(qpos=model.qpos0))
+        # What touches does not count, and MJX has no data for some that does.
+        nothing = np.zeros_like(model.geom_contype)
+        alone = model.replace(geom_contype=nothing, geom_conaffinity=nothing, npair=0)  # pyright: ignore[reportCallIssue]
+        data = kinematics.up_to_inertia(model, mjx.make_data(alone).replace(qpos=model.qpos0))
         mass = mjx.full_m(model, data)
         inverse, first = jnp.linalg.inv(mass), tree.first_dofs(model)
         is_same = first[:, None] == first  # of a ball joint, or half of a free joint, over which weights are averaged

@@ -88,7 +88,7 @@ def fit(
         count: number of measured numbers.
         say: called after each ensemble.
     """
-    rng, dim, lowest = np.random.default_rng(0), len(point[0]), np.inf
+    rng, dim, lowest, wide = np.random.default_rng(0), len(point[0]), np.inf, np.inf
     free = widths[1].shape[1]
     own, along = widths[1][:, :, None] * np.eye(free), np.zeros((*point[1].shape, dim))
     law = _Law(*point, np.diag(widths[0]), own, along)
@@ -111,7 +111,9 @@ def fit(
         change = step.values * min(1.0, _LONGEST / max(length, 1e-300))
         moved, misfit = at(factors, change)
         # A mean that explains less than that of a wider ensemble has missed: between two teeth all looks smooth.
-        has_missed, lowest = misfit > max(most, lowest * most / (count * noise**2)), min(lowest, misfit)
+        is_worse, width = misfit > max(most, lowest * most / (count * noise**2)), float(np.log(law.variances).mean())
+        has_missed = is_worse and width <= wide
+        lowest, wide = (lowest, wide) if misfit >= lowest else (misfit, width)
         num = min(2 * num, _MORE * fewest) if has_missed else num  # few motions lack directions of chatter
         growth = float(np.sqrt(max(misfit / (count * noise**2), 1.0))) * noise
         before, kept = law, (_WIDER if has_missed else _NARROWER) * law.root

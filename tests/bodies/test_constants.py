@@ -49,6 +49,17 @@ def test_constants_are_those_of_c(name):
         np.testing.assert_allclose(getattr(found, field), expected[field], rtol=1e-9, atol=1e-12 * scale, err_msg=field)
 
 
+@pytest.mark.parametrize("pair", ["", '<contact><pair geom1="can" geom2="table"/></contact>'])
+def test_bodies_whose_contact_mjx_lacks_have_constants(pair):
+    scene = mg.load_scene(
+        f"""<mujoco><worldbody><geom name="table" type="box" size="1 1 .1"/><body name="can" pos="0 0 .2"><freejoint/>
+        <geom name="can" type="cylinder" size=".03 .1"/></body></worldbody>{pair}</mujoco>""",
+        engine="mujoco",
+    )
+    heavier = scene.with_model(body_mass=2 * scene.mj_model.body_mass)
+    np.testing.assert_allclose(heavier.model.body_invweight0[1, 0], 0.5 * scene.mj_model.body_invweight0[1, 0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["hopper", "ant"])
 def test_derivatives_by_every_mass_inertia_and_armature_are_those_of_differences(name):
     """Of a random sum of all constants, by central differences of C: to 1e-6, as differences are with a step of 1e-5."""
