@@ -37,7 +37,8 @@ _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "ve
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
 # Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
-_STEEP, _NARROWER = 10.0, 1 / 30
+_STEEP, _NARROWER, _WIDER = 1.0, 1 / 30, 30.0
+_NEARLY = 0.1  # of what is too steep, from which columns beside such a one are differenced, too
 # Of the steps that are subtracted: what a solve leaves is divided by the width, and so is what a search for a contact leaves.
 _TOLERANCE, _ITERATIONS = 1e-16, 200
 _CONTACT_TOLERANCE = 1e-14  # m
@@ -245,12 +246,13 @@ class Worker:
                     value[:] = 0.0
                 self._differentiate(one, names)
                 self._assemble(raw, [(0, one)] * one.is_explicit, names)
-        if one.is_explicit and self._is_steep(one.found["state"]):
-            kept = {name: one.found[name].copy() for name in ("state", "ctrl") if name in one.found}
-            self._by_steps(one)
-            if not self._steepness(one.found["state"]) < 0.5 * self._steepness(kept["state"]):
-                for name, value in kept.items():
-                    one.found[name][:] = value
+        matrix, nv = one.found["state"], self.layout.nv
+        if one.is_explicit and self._is_steep(matrix):
+            columns = np.flatnonzero(~(self._steepness(matrix) <= _NEARLY * _STEEP / self.model.opt.timestep))
+            others = matrix.copy()
+            others[:, columns] = self._smooth(one, np.eye(nv, len(matrix))[columns], self._width(one)).T
+            if self._steepness(others).max() < 0.5 * self._steepness(matrix).max():
+                matrix[:] = others
 
     def _decide(self, one: _Row) -> None:
         """Take the model in which gaps of the size of rounding are as they were in the step."""
@@ -338,8 +340,7 @@ class Worker:
 
     def _by_steps(self, one: _Row) -> None:
         """Write differences of whole steps by state and controls."""
-        width = WIDTH if one.near is None or not len(one.near.rough) or self.surfaces.has_stages else _RUBBING
-        layout = self.layout
+        layout, width = self.layout, self._width(one)
         one.found["state"][:] = self._smooth(one, np.eye(layout.num_changes), width).T
         if "ctrl" in one.found:
             place = layout.places["ctrl"]
@@ -349,17 +350,26 @@ class Worker:
             starts[np.arange(len(entries)), :, entries] = np.stack([up, down], axis=1)
             one.found["ctrl"][:] = self._between(one, starts, size).T
 
+    def _width(self, one: _Row) -> float:
+        """Return the width of differences of whole steps."""
+        return WIDTH if one.near is None or not len(one.near.rough) or self.surfaces.has_stages else _RUBBING
+
     def _smooth(self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float) -> np.ndarray:
-        """Return differences along directions, over one side where the other has a jump, and narrower where both have."""
+        """Return differences along directions, over one side where the other has a jump, and narrower or wider where both have.
+
+        A surface that is near has one jump. The points at which a bottle stands on a table jump with every turn: then all are
+        averaged over.
+        """
         # A stage of Runge-Kutta may meet a surface that the start is far from.
         is_own = one.clear is one.before and one.by is self.inverse
         middle = one.after if is_own else self._step(one.by, one.clear)
         found, sizes = np.zeros_like(directions), np.full(len(directions), np.inf)
         left, had_jump, signs = np.arange(len(sizes)), np.zeros(len(sizes), bool), np.array([1.0, -1.0])
-        for narrower in (1.0, _NARROWER, _NARROWER**2):
-            starts = self.layout.moved(one.clear, narrower * width * signs[:, None] * directions[left, None])
+        wider = (_WIDER, _WIDER**2) if width < _RUBBING else ()
+        for factor in (1.0, _NARROWER, _NARROWER**2, *wider):
+            starts = self.layout.moved(one.clear, factor * width * signs[:, None] * directions[left, None])
             ends = self._steps(one.by, starts)
-            sides = self.layout.difference(ends, middle) * signs[:, None] / (narrower * width)
+            sides = self.layout.difference(ends, middle) * signs[:, None] / (factor * width)
             both, size = np.linalg.norm(sides, axis=2), np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1)
             jumps = (size > APART * both.max(axis=1)) & (both.max(axis=1) > 1 / self.model.opt.timestep)
             least = np.take_along_axis(sides, both.argmin(axis=1)[:, None, None], axis=1)[:, 0]
@@ -368,7 +378,7 @@ class Worker:
             is_better = (size < 0.5 * sizes[left]) | (had_jump[left] & ~jumps)
             index = left[is_better]
             found[index], sizes[index], had_jump[index] = chosen[is_better], size[is_better], jumps[is_better]
-            left = left[jumps | (size > 1 / self.model.opt.timestep)]
+            left = left[jumps | (size > 1 / self.model.opt.timestep) | (factor > 1.0)]
             if not left.size:
                 break
         return found
@@ -390,15 +400,15 @@ class Worker:
             row = layout.moved(row, 8 * change)
         return row
 
-    def _steepness(self, matrix: Float[np.ndarray, "... size size"]) -> float:
-        """Return the largest change of a velocity with a position, both of the farthest points that they move (1/s)."""
+    def _steepness(self, matrix: Float[np.ndarray, "... size size"]) -> Float[np.ndarray, "... nv"]:
+        """Return the largest change of a velocity with each position, both of the farthest points that they move (1/s)."""
         lengths = self.surfaces.lengths
         nv = len(lengths)
-        return np.abs(matrix[..., nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(initial=0.0)
+        return np.abs(matrix[..., nv : 2 * nv, :nv] * lengths[:, None] / lengths).max(axis=-2, initial=0.0)
 
     def _is_steep(self, matrix: Float[np.ndarray, "... size size"]) -> bool:
         """Return whether differences are steeper than any contact, so that they step over a jump."""
-        return not self._steepness(matrix) <= _STEEP / self.model.opt.timestep
+        return not (self._steepness(matrix) <= _STEEP / self.model.opt.timestep).all()
 
     @np.errstate(invalid="ignore", over="ignore", divide="ignore")
     def sense(self, steps: Steps, index: list[int]) -> None:

@@ -105,7 +105,7 @@ class Controller(Printed):
         self.price = {name: len(self._schedules[1]) * x for name, x in self._iteration.seconds.items()}
         self.reset()
         if deadline is not None and sum(self._iteration.seconds.values()) > deadline:
-            warnings.warn(self._too_short(self._one_step(problem, start), deadline), stacklevel=2)
+            warnings.warn(self._too_short(self._one_step(problem, start, deadline), deadline), stacklevel=2)
 
     @property
     def cost(self) -> Cost:
@@ -250,12 +250,15 @@ class Controller(Printed):
             raise ValueError(f"state must be finite, got {vector.tolist()}")
         return vector
 
-    def _one_step(self, problem: Problem, controls: Array) -> float:
-        """Return the time of an iteration of a plan of one step."""
+    def _one_step(self, problem: Problem, controls: Array, deadline: float) -> float:
+        """Return the time of an iteration of a plan of one step, or of its linear model where this exceeds the deadline."""
         # A part of the time is the same for all plans, so that a shorter plan takes more than its share.
         took = sum(self._iteration.seconds.values())
         if len(controls) == 1:
             return took
+        models = self._iteration.seconds[PARTS[0]] / self._iteration.num_pieces
+        if self._iteration.count == 1 and models > deadline:
+            return models  # too long already, without the seconds that it takes to compile the rest
         problem, still = dataclasses.replace(problem, keys=problem.keys[:1]), np.zeros_like(self._noise(0, 1))
         short = Iteration(problem, self.cost, controls[:1], self._typical(), still, count=1)
         self.compile_seconds += short.compile_seconds

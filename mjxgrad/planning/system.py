@@ -3,6 +3,7 @@
 A state is one flat vector. A change of it has the coordinates of the tangent space: `retract` and `difference` convert.
 """
 
+import copy
 import dataclasses
 import functools
 from abc import abstractmethod
@@ -32,6 +33,7 @@ ControlVector = Float[Array, " m"]
 ChangeVector = Float[Array, " n"]
 _REACH = 4.0  # lengths
 _ALONE = 1e6  # of a geom's weight beside another's, so that its impedance is that of the contact
+_HAIR = 1e-3  # m: what is drawn on a table touches it to rounding, or not quite
 _Jacobian = Float[Array, "n both"]
 
 
@@ -241,7 +243,9 @@ class SceneSystem(System):
 
 
 def resting(model: mujoco.MjModel, qpos: Float[ArrayLike, " nq"]) -> Int[np.ndarray, "contacts 2"]:
-    """Return the pairs of geoms that touch in a pose, of which one is fixed."""
+    """Return the pairs of geoms that touch in a pose, or nearly, of which one is fixed."""
+    model = copy.copy(model)
+    model.geom_margin += _HAIR / 2
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)

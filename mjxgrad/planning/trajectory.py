@@ -85,6 +85,9 @@ class Plan(eqx.Module, Printed):
             )
         if self.diverged:
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
+        if not jnp.isfinite(self.iterations.promised[-1]):
+            steep = "the derivatives of its steps multiply beyond all numbers"
+            return f"not improved: {steep}; give the system contact=mg.Slope(), or take a shorter plan or more smoothing"
         return "converged" if self.converged else "not converged; take more iterations"
 
     def __str__(self) -> str:
@@ -357,10 +360,10 @@ def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: 
     def spread(moved, given):
         model, change = given
         moved = model.A @ moved + model.B @ change
-        return moved, jnp.abs(moved)
+        return moved, jnp.abs(moved) <= _INFLUENCE * jnp.abs(moved).max()  # of this step: later ones may grow without bounds
 
-    _, moved = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models, signs.astype(slopes.dtype)))
-    return (gain > _TOLERANCE * jnp.abs(cost)) & (moved.max(axis=0) <= _INFLUENCE * jnp.max(moved))
+    _, is_still = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models, signs.astype(slopes.dtype)))
+    return (gain > _TOLERANCE * jnp.abs(cost)) & is_still.all(axis=0)
 
 
 def backward_pass(

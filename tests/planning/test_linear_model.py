@@ -68,6 +68,19 @@ def test_smoothing_that_reaches_the_floor_under_a_resting_body_is_warned_about(h
     jax.eval_shape(lambda x: Analytic(Smoothing(0.01)).warnings(system, x), start)
 
 
+def test_a_bottle_that_is_drawn_on_a_table_stands_there_under_widened_contacts():
+    """Its gap is zero, at which a search finds no contact yet."""
+    system = SceneSystem(
+        mg.load_scene(
+            """<mujoco><worldbody><geom type="box" size=".5 .5 .02" pos="0 0 -.02"/>
+            <body pos="0 .1 .08"><freejoint/><geom type="cylinder" size=".03 .08"/></body>
+            <body pos="0 0 .08"><joint type="slide" axis="0 1 0"/><geom size=".02"/></body></worldbody></mujoco>""",
+            engine="mujoco",
+        )
+    )
+    np.testing.assert_array_equal(system.widened(0.01).scene.model.geom_margin > 0, [False, False, True])
+
+
 IMPEDANCE = 1e-3
 
 

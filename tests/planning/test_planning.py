@@ -171,6 +171,24 @@ def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves():
     )
 
 
+def _swinging(growth):
+    """Return the plan of a mass that a control moves and a second coordinate that multiplies in each step."""
+    system = FunctionSystem(lambda x, u: jnp.stack([x[0] + u[0], growth * (x[1] + u[0])]), 2, 1)
+    given = GoalCost(jnp.ones(2), jnp.zeros(2), jnp.ones(2), 0.01), jnp.zeros(2), jnp.zeros((8, 1)), jax.random.key(0)
+    return optimise_trajectory(system, *given, smoother=Exact(), schedule=np.ones(3))
+
+
+def test_what_multiplies_hides_nothing_that_is_moved():
+    assert _swinging(30.0).unmoved.tolist() == [False, False]
+
+
+def test_derivatives_that_are_no_numbers_are_told():
+    plan = _swinging(1e60)
+    assert plan.cost == plan.start_cost
+    assert not plan.converged
+    assert plan.verdict().startswith("not improved: the derivatives of its steps multiply beyond all numbers; give")
+
+
 def test_a_plan_is_the_rollout_of_its_controls():
     plan = pushing(Softly(jnp.array(0.3)))
     state = plan.states[0]
