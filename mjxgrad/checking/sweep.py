@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from mjxgrad._arrays import function, is_known, real, whole
 from mjxgrad._text import Paged, aligned, duration, format_number
@@ -236,12 +236,21 @@ class Sweep(Paged):
                     found[name] = np.sqrt(square) / np.abs(table["truth"][:, 0])
         return found
 
+    def _untold(self) -> Bool[np.ndarray, " softness"]:
+        """Return where the gradient is not told from zero, so that no error is a share of it."""
+        low, high = (self.result.table()[f"truth_{end}"][:, 0] for end in ("low", "high"))
+        return (low <= 0) & (high >= 0)
+
     def best(self) -> list[str]:
-        """Return what to take at each stiffness: what errs least, α-order only where it gains more than a tenth, or "none"."""
+        """Return what to take at each stiffness: what errs least, α-order only where it gains more than a tenth, or "none".
+
+        None is taken where all are far off, or nothing is told from zero.
+        """
         errors = self.errors()
         factors = {"alpha_order": 1.1}
         ranks = np.array([np.nan_to_num(factors.get(name, 1.0) * x, nan=np.inf) for name, x in errors.items()])
-        return [list(errors)[k] if rank[k] < _HOPELESS else "none" for rank in ranks.T for k in [int(np.argmin(rank))]]
+        is_told = (ranks.min(axis=0) < _HOPELESS) & ~self._untold()
+        return [list(errors)[k] if told else "none" for k, told in zip(ranks.argmin(axis=0), is_told, strict=True)]
 
     @property
     def headline(self) -> str:
@@ -253,6 +262,10 @@ class Sweep(Paged):
         if np.abs(table["truth"]).max() <= _UNFELT * np.abs(self.result.cost).max():
             return "The noise does not reach the cost: what moves does not touch what counts; start nearer, or look further."
         row, best, errors = int(np.argmin(abs(self.result.knob[1] - self.own))), self.best(), self.errors()
+        if self._untold()[row]:
+            truth, high = table["truth"][row, 0], table["truth_high"][row, 0]
+            told = f"The gradient is not told from zero: {truth:.2g} ± {high - truth:.2g}, so that no estimate can be judged"
+            return f"{told}: start nearer, look further ahead, or take more rollouts."
         if (taken := best[row]) == "none":
             far = f"From {BATCH} rollouts no estimate is within {percent(_HOPELESS)} of the gradient"
             return f"{far}: take softer contact, a shorter time step or a shorter horizon."
@@ -285,7 +298,15 @@ class Sweep(Paged):
         """Return the table of errors as text, header first; the estimate to take is marked."""
         errors, best = self.errors(), self.best()
         head = ["stiffness, 1/s²", *(ESTIMATES[name] for name in errors), "take"]
-        cells = [[percent(x) for x in errors[name]] for name in errors]
+        table, untold = self.result.table(), self._untold()
+        # At least that of the largest gradient that it may be.
+        share = abs(table["truth"][:, 0]) / np.maximum(abs(table["truth_low"]), abs(table["truth_high"]))[:, 0]
+        least = np.where(untold, share, 1.0)
+        heads = ["over " if one else "" for one in untold]
+        cells = [
+            [head + percent(x).removeprefix(head) for head, x in zip(heads, least * errors[name], strict=True)]
+            for name in errors
+        ]
         return [head, *map(list, zip(self.labels, *cells, [_NAMES[name] for name in best], strict=True))]
 
     def as_html(self) -> str:

@@ -114,7 +114,7 @@ def fit(
         is_worse, width = misfit > max(most, lowest * most / (count * noise**2)), float(np.log(law.variances).mean())
         has_missed = is_worse and width <= wide
         lowest, wide = (lowest, wide) if misfit >= lowest else (misfit, width)
-        num = min(2 * num, _MORE * fewest) if has_missed else num  # few motions lack directions of chatter
+        num = min(2 * num, _MORE * fewest) if is_worse else num  # few motions lack directions of chatter
         growth = float(np.sqrt(max(misfit / (count * noise**2), 1.0))) * noise
         before, kept = law, (_WIDER if has_missed else _NARROWER) * law.root
         law = _law(factors, middle + change, centres + moved, growth, kept, change)
@@ -123,7 +123,7 @@ def fit(
         is_late = misfit <= most and spent >= EXPECTED * fewest
         is_enough = is_late or (misfit <= most and bool((law.variances < _SURE**2).all()))
         stays = length < _SHORT * np.sqrt(dim) and (is_narrow or is_enough)
-        is_short = stays and not has_missed and index >= _FEWEST
+        is_short = stays and not is_worse and index >= _FEWEST
         ends = [*ends, law] if is_short or ends else []
         found = _mean_of(ends or [law], factors, misfit, drawn)
         # Of those that explain all but noise the last has the narrowest intervals.

@@ -244,7 +244,8 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
         {"first": 0.16, "zeroth": 4.0, "alpha_order": 1.0},
     )
     biases = {"first": [0.0, 0.0, 0.5], "zeroth": [0.0, 0.0, 0.0], "alpha_order": [0.0, 0.0, 0.1]}
-    table = {"truth": np.array([[1.0], [1.0], [-1.0]])}
+    truth = np.array([[1.0], [1.0], [-1.0]])
+    table = {"truth": truth, "truth_low": truth - 0.1, "truth_high": truth + 0.1}
     for name, half in halves.items():
         bias = np.array(biases[name])[:, None]
         table |= {f"{name}_bias": bias, f"{name}_bias_low": bias - half, f"{name}_bias_high": bias + half}
@@ -269,6 +270,14 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
         "take softer contact, a shorter time step or a shorter horizon."
     )
     assert swept.best() == ["first", "none", "zeroth"]
+    table["truth_low"] = table["truth"] - 1.6
+    assert swept.headline == (
+        "The gradient is not told from zero: 1 ± 0.1, so that no estimate can be judged: "
+        "start nearer, look further ahead, or take more rollouts."
+    )
+    assert swept.best() == ["none", "none", "zeroth"]
+    assert swept._rows()[3][2] == "50 %"  # what is off by 0.5 of what is at most 1.1 is off by 45 %
+    assert swept._rows()[1][2] == "over 45 %"
     table |= {name: np.zeros((3, 1)) for name in table if name.endswith("_bias") or name == "truth"}
     assert swept.headline.startswith("Stiffness changes nothing: nothing touches")
 
