@@ -150,7 +150,7 @@ def test_the_readmes_examples_run_and_their_derivative_is_the_slope(capsys):
     ends = jax.jit(jax.vmap(names["distance"]))(names["velocity"] + steps)
     slopes = (ends[:3] - ends[3:]) / 0.1
     np.testing.assert_allclose(names["slope"], slopes, atol=0.1 * np.abs(slopes).max())
-    assert names["result"].params > 0.65
+    assert names["result"].best_params > 0.65
     assert float(re.search(r"rad, cost (\S+) m²", capsys.readouterr().out)[1]) < 0.01
 
 

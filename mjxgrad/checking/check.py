@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from mjxgrad._arrays import function, instance, real, whole
+from mjxgrad._interrupts import finished, patiently
 from mjxgrad._text import Paged, format_number
 from mjxgrad.batched import device
 from mjxgrad.checking import findings
@@ -179,40 +180,70 @@ def check(
         scene = source if isinstance(source, Scene) else load_scene(source, engine=engine)
         outcome = named_cost(scene, cost) if isinstance(cost, str) else as_pytree(cost)
         started = time.perf_counter()
-        motions = random_motions(scene, rng)
-        stability = check_stability(scene, speed=motions.touch_speed or None)
+        try:
+            motions = patiently(lambda: random_motions(scene, rng))
+            stability = check_stability(scene, speed=motions.touch_speed or None)
+        except KeyboardInterrupt:
+            say(f"interrupted before anything was measured of\n\n{scene.summary()}")
+            raise
     found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
     names, outcomes = outcomes_of(scene, outcome, rng)
     is_any_sound = (motions.bad_steps < 0).any()
-    if outcome is not None and is_any_sound:
-        found += findings.index_findings(scene, motions, outcome)
-        found.append(findings.cost_finding(motions, Mover(scene, 1, outcomes)))
-    # Prices come first: after Ctrl-C there is nothing left to measure.
-    measured, asked = None, time.perf_counter()
-    prices = seconds_of(scene) if scene.model.nu and is_any_sound else {}
+    measured, prices, was_interrupted = None, {}, False
+    # After Ctrl-C, whenever it comes, the verdict is of what is known by then.
+    try:
+        if outcome is not None and is_any_sound:
+            found += findings.index_findings(scene, motions, outcome)
+            found.append(patiently(lambda: findings.cost_finding(motions, Mover(scene, 1, outcomes))))
+        # Prices come first: after Ctrl-C there is nothing left to measure.
+        asked = time.perf_counter()
+        if scene.model.nu and is_any_sound:
+            say("timing gradients by C MuJoCo")
+            prices = patiently(lambda: seconds_of(scene))
+        if derivatives and is_any_sound:
+            say("measuring derivatives by C MuJoCo")
+            end = max(begun + budget, started + budget / 2) + time.perf_counter() - asked
+            mover = Mover(scene, _BATCH, outcomes, end)
+            settings = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
+            with contextlib.suppress(TimeoutError):
+                measured = measure(scene, motions, mover, rng, **settings)
+        was_interrupted = measured is not None and measured.was_interrupted
+        if mjx and is_any_sound and not was_interrupted:
+            say("compiling a step by MJX")
+            found.append(findings.engine_finding(scene, motions))
+    except KeyboardInterrupt:
+        was_interrupted = True
+    path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     if derivatives and is_any_sound:
-        say("measuring derivatives by C MuJoCo")
-        end = max(begun + budget, started + budget / 2) + time.perf_counter() - asked
-        mover = Mover(scene, _BATCH, outcomes, end)
-        settings = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
-        with contextlib.suppress(TimeoutError, KeyboardInterrupt):
-            measured = measure(scene, motions, mover, rng, **settings)
         measured = measured if measured and measured.lines else None
         found += findings.measured_findings(measured) if measured else ()
-        found += findings.left_out_findings(measured, budget)
-    if mjx and is_any_sound:
-        say("compiling a step by MJX")
-        found.append(findings.engine_finding(scene, motions))
+        found += findings.left_out_findings(measured, None if was_interrupted else budget)
+    seen = scene, motions, stability, measured, prices
+    return finished(lambda: _verdict(*seen, [*found], names, path, None if was_interrupted else say))
+
+
+def _verdict(
+    scene: Scene,
+    motions: Motions,
+    stability: StabilityReport,
+    measured: Measured | None,
+    prices: dict[str, float],
+    found: list[Finding],
+    names: tuple[str, ...],
+    path: str,
+    say: Callable[[str], None] | None,
+) -> Verdict:
+    """Return what all findings amount to; without `say` engines are not compared."""
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
     price = prices["slope"] / prices["discrete"] if prices else math.inf
     advice = findings.recommend(motions, stability, measured, slots, price)
     # It compiles for minutes, which a quick check, or one that was interrupted, does not wait for.
-    is_asked = prices and measured and not measured.was_interrupted and not device.is_cpu()
-    if is_asked and (seconds := seconds_by_engine(scene, ENGINES, say)):
+    is_asked = prices and measured and not device.is_cpu()
+    if say and is_asked and (seconds := seconds_by_engine(scene, ENGINES, say)):
         advice = dataclasses.replace(advice, engine=min(seconds, key=lambda engine: seconds[engine][1]))
         found.append(findings.engine_prices_finding(seconds))
     told = slopes(measured.lines) if measured else ()
@@ -220,7 +251,6 @@ def check(
         prices = {kind: advice.horizon * seconds for kind, seconds in prices.items()}
         found.append(findings.price_finding(prices, told, advice.horizon))
     order = {"slope": 0, "price": 1, "left_out": 3, "not_measured": 3}
-    path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
     return Verdict(
         name=scene.name,
         headline=findings.headline(found, advice, motions, told, prices),

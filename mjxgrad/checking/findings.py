@@ -228,14 +228,15 @@ def measured_findings(measured: Measured) -> Iterator[Finding]:
     yield from _order_findings(measured)
 
 
-def left_out_findings(measured: Measured | None, budget: int | float) -> Iterator[Finding]:
-    """Yield the measurements that were left out for lack of time."""
+def left_out_findings(measured: Measured | None, budget: int | float | None) -> Iterator[Finding]:
+    """Yield the measurements that were left out for lack of time; without a budget, by an interruption."""
     if measured is None:
-        text = f"Derivatives were not measured within a budget of {budget:g} s; a larger one measures them."
-        yield Finding("not_measured", text)
+        within = "" if budget is None else f" within a budget of {budget:g} s; a larger one measures them"
+        yield Finding("not_measured", f"Derivatives were not measured{within or ': it was interrupted'}.")
     elif measured.left_out:
-        text = f"Left out for a budget of {budget:g} s: {'; '.join(measured.left_out)}. A larger one measures it, too."
-        yield Finding("left_out", text)
+        why = "after an interruption" if budget is None else f"for a budget of {budget:g} s"
+        remedy = "" if budget is None else " A larger one measures it, too."
+        yield Finding("left_out", f"Left out {why}: {'; '.join(measured.left_out)}.{remedy}")
 
 
 def slope_finding(found: Sequence[Slope]) -> Finding:

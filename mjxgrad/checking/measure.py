@@ -202,7 +202,7 @@ def measure(
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
     mover.is_needed = True
-    lengths = _lengths(mover, motions, order[0], begins[0], onsets, seconds)
+    lengths = patiently(lambda: _lengths(mover, motions, order[0], begins[0], onsets, seconds))
     num_steps = lengths[-1]
     # A motion with a late first touch starts shortly before it.
     begins = [min(begin, motions.controls.shape[1] - num_steps) for begin in begins]
@@ -232,7 +232,7 @@ def measure(
         # There is a verdict in any case: of a line, and its slope by the fewest motions.
         mover.end, mover.is_needed = end, number == 0
         try:
-            measure_one(*task)
+            patiently(functools.partial(measure_one, *task))
             errors = (f"{one.kind} {one.error:.1%} off" for one in slopes(lines) if one.errors.size)
             log("; ".join([f"{number + 1} of {len(asked)}: {words}", *errors]))
         except TimeoutError:

@@ -234,7 +234,10 @@ class Inverse:
         """Return the accelerations that solve R = 0 at other positions, by Newton's method with the derivative at hand."""
         # Two steps: the first follows the geometry, the second takes what forces then have beyond their linear change.
         found = []
-        inverse = np.linalg.inv(matrix.T)
+        try:
+            inverse = np.linalg.inv(matrix.T)
+        except np.linalg.LinAlgError:
+            inverse = _of_divergence(matrix.T)
         self._set(row, acceleration)
         for place in places:
             self.qpos[:], self.qacc[:] = place, acceleration
@@ -307,6 +310,11 @@ def shapes(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
     return found | {f"next {name}": (found[name][0], na) for name in ("qpos", "qvel", "act", "ctrl")}
 
 
+def _of_divergence(matrices: Float[np.ndarray, "*rows nv nv"]) -> Float[np.ndarray, "*rows nv nv"]:
+    """Return some inverse of matrices that have none: those of motions that diverge, which are flagged elsewhere."""
+    return np.linalg.pinv(np.where(np.isfinite(matrices), matrices, 0.0))
+
+
 def step_of(
     layout: Layout, timestep: float, speeds: Float[np.ndarray, "rows nv"], found: _Found, names: list[str]
 ) -> _Found:
@@ -319,8 +327,8 @@ def step_of(
     matrices = np.swapaxes(found["qacc"], -1, -2)
     try:
         change = -timestep * np.linalg.solve(matrices, right)
-    except np.linalg.LinAlgError:  # of a motion that diverges
-        change = -timestep * np.linalg.pinv(np.where(np.isfinite(matrices), matrices, 0.0)) @ right
+    except np.linalg.LinAlgError:
+        change = -timestep * _of_divergence(matrices) @ right
     change[..., nv : 2 * nv] += np.eye(nv)
     turned = timestep * speeds
     moved = layout.follow(turned, timestep * change)

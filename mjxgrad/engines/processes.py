@@ -124,7 +124,7 @@ class Processes:
                 pickle.dump((key, new, task), pipes.stdin, pickle.HIGHEST_PROTOCOL)
                 pipes.stdin.flush()
                 error = pickle.load(pipes.stdout)
-            except EOFError:
+            except (EOFError, pickle.UnpicklingError):  # before or within its answer
                 raise BrokenPipeError("a process that takes derivatives has ended") from None
         if error is not None:
             raise error
@@ -142,7 +142,7 @@ def serve() -> None:
     while True:
         try:
             key, model, (path, shapes, piece, method, arguments) = pickle.load(asked)
-        except EOFError:
+        except (EOFError, pickle.UnpicklingError):  # whoever asked has ended, perhaps within a question
             return
         error = None
         try:

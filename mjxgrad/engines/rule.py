@@ -24,7 +24,7 @@ from mjxgrad.bodies.kinematics import integrate_position, position_change
 from mjxgrad.engines.flight import NUM_SLOTS, PAIRS, advance, begin
 from mjxgrad.engines.jacobians import with_pairs
 from mjxgrad.engines.layout import MOTION
-from mjxgrad.engines.pool import ONCE, Pool, pool_of
+from mjxgrad.engines.pool import ONCE, pool_of
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import changed_numbers
 from mjxgrad.stepping import Gradient
@@ -58,7 +58,7 @@ def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gr
         timestep = numbers.get("opt.timestep", scene.mj_model.opt.timestep)
         before["time"] = start["time"] + timestep * jnp.arange(horizon, dtype=dtype)[:, None]
         wanted = (*with_pairs(tuple(given)), "flight") if gradient == "slope" else tuple(given)
-        maps = _maps(pool, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
+        maps = _maps(scene, numbers, before, inputs, start["flight"], gradient=gradient, wanted=wanted)
         forced = {}
         for part, prefix in (("state", ""), ("felt", "felt ")):
             if part in maps:
@@ -105,7 +105,7 @@ def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient
     pool = pool_of(scene.mj_model)
     shapes = pool.shapes(("ctrl",), _sizes({}, inputs)) | {"end": (sum(start[name].size for name in MOTION),)}
     function = functools.partial(pool.product, gradient=gradient)
-    return _once(function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
+    return _once(scene, function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
 
 
 def linearise(
@@ -115,12 +115,13 @@ def linearise(
     pool, before = pool_of(scene.mj_model), {name: x[None] for name, x in start.items()}
     numbers, dtype, size = changed_numbers(scene), start["qpos"].dtype, pool.layout.num_changes
     flight = jnp.zeros(pool.flight_shape, dtype)
-    found = _maps(pool, numbers, before, inputs, flight, gradient=gradient, wanted=("ctrl",))
+    found = _maps(scene, numbers, before, inputs, flight, gradient=gradient, wanted=("ctrl",))
     shapes = {
         "state": (1, scene.mj_model.nsensordata, size),
         "ctrl": (1, scene.mj_model.nsensordata, scene.mj_model.nu),
     }
-    sensed = _once(functools.partial(pool.sense, wanted=("state", "ctrl")), shapes, dtype, numbers, before, inputs)
+    function = functools.partial(pool.sense, wanted=("state", "ctrl"))
+    sensed = _once(scene, function, shapes, dtype, numbers, before, inputs)
     return found["state"][0], found["ctrl"][0], sensed["state"][0], sensed["ctrl"][0]
 
 
@@ -142,7 +143,8 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
         sizes = _sizes(numbers, inputs) | {"state": pool.layout.num_changes}
         wanted = ("state", *given)
         shapes = {name: (times, count, sizes[name]) for name in wanted}
-        found = _once(functools.partial(pool.sense, wanted=wanted), shapes, dtype, numbers, states, inputs)
+        function = functools.partial(pool.sense, wanted=wanted)
+        found = _once(scene, function, shapes, dtype, numbers, states, inputs)
 
         def in_tangent_space(qpos: Array, change: Array) -> Array:
             return jax.jvp(functools.partial(position_change, scene.model, qpos), (qpos,), (change,))[1]
@@ -156,11 +158,13 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
 
 
 def _maps(
-    pool: Pool, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
+    scene: Scene, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
 ) -> dict[str, Array]:
-    horizon, every = len(inputs["ctrl"]), pool.shapes(how["wanted"], _sizes(numbers, inputs))
+    pool, horizon = pool_of(scene.mj_model), len(inputs["ctrl"])
+    every = pool.shapes(how["wanted"], _sizes(numbers, inputs))
     shapes = {k: v if k in ONCE else (horizon, *v) for k, v in every.items()}
-    return _once(functools.partial(pool.maps, **how), shapes, before["qpos"].dtype, numbers, before, inputs, flight)
+    function = functools.partial(pool.maps, **how)
+    return _once(scene, function, shapes, before["qpos"].dtype, numbers, before, inputs, flight)
 
 
 def _sizes(numbers: _Arrays, inputs: _Arrays) -> dict[str, int]:
@@ -185,7 +189,9 @@ def _added(change: Array, by: _Arrays, given: _Arrays, inputs: Mapping[str, Any]
     return change
 
 
-def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *arguments) -> dict[str, Array]:
+def _once(
+    scene: Scene, function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *arguments: Any
+) -> dict[str, Array]:
     """Call C MuJoCo for derivatives; they have none of their own."""
     wanted = {name: jax.ShapeDtypeStruct(shape, dtype) for name, shape in shapes.items()}
 
@@ -195,7 +201,9 @@ def _once(function, shapes: Mapping[str, tuple[int, ...]], dtype: Any, *argument
 
     @call.defjvp
     def _refuse(primals, tangents):
-        raise ValueError('C MuJoCo has first derivatives alone: for second ones take engine "mjx"')
+        remedy = 'for second ones take engine "mjx"'
+        lack = scene.unsupported and f"this scene has no second ones: {scene.unsupported}"
+        raise ValueError(f"C MuJoCo has first derivatives alone: {lack or remedy}")
 
     return call(*arguments)
 

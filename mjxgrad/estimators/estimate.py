@@ -18,6 +18,8 @@ from mjxgrad.estimators.moments import Moments
 from mjxgrad.estimators.samples import Plan
 from mjxgrad.objective.base import Scalar, Vector
 
+_UNFELT = 1e-12  # of the cost, for each unit of a parameter: a gradient below is rounding
+
 
 class Diagnosis(eqx.Enumeration):
     """The soundness of an estimate; `Diagnosis[estimate.diagnosis]` is the sentence."""
@@ -87,13 +89,19 @@ class GradientEstimate(eqx.Module, Printed):
         if not is_known(self.num_samples) or jnp.ndim(self.num_samples):
             return repr(self)
         parts = [np.asarray(ravel_pytree(part)[0]) for part in (self.value, self.standard_error)]
+        # Solvers stop at a tolerance: derivatives by what is not touched are then 1e-20, and costs scatter a little.
+        is_unfelt = max(map(np.linalg.norm, parts)) <= _UNFELT * abs(float(self.objective_mean))
         if is_long := (size := parts[0].size) > 6:
             parts = [np.array([np.linalg.norm(part)]) for part in parts]
         pairs = [*zip(*parts, strict=True), (self.objective_mean, self.objective_standard_error)]
         *shown, cost = (f"{format_number(float(x))} ± {format_number(float(error))}" for x, error in pairs)
         head = f"of {size} numbers, of norm {shown[0]}" if is_long else ", ".join(shown)
         spent = f"{int(self.num_rollouts)} rollouts: {Diagnosis[self.diagnosis]}"
-        why = f"α is {float(self.alpha):.3g}: {Reason[self.reason]}. ± is a standard error."
+        reason = Reason[self.reason]
+        if is_unfelt and reason != Reason[Reason.nothing_felt]:
+            reason = "the gradient is zero to rounding, so nothing is felt: "
+            reason += "the cost does not depend on what is moved, or only by jumps"
+        why = f"α is {float(self.alpha):.3g}: {reason}. ± is a standard error."
         return f"Gradient {head}; cost {cost}; {spent}. {why}"
 
     @property

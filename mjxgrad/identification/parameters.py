@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import itertools
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,10 +18,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from mjxgrad._arrays import function, instance, real, traceable
 from mjxgrad._mjx import mjx
+from mjxgrad._text import name_pairs
 from mjxgrad.contact import Softness
 from mjxgrad.contact.parameters import ContactParameters, contact_parameters, deciding_geoms
 from mjxgrad.engines.state import check_scene
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping.rows import index_of
 
 Write = Callable[[mjx.Model, Array], dict[str, Array]]
@@ -215,10 +217,18 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
 
     The contacts are selected by `pairs` or `geoms`, as in `Softness`; all by default.
 
+    Warns:
+        SceneWarning: if the contacts differ in the scene, and become alike.
+
     Raises:
         ValueError: if a name is unknown or can touch nothing.
     """
     named = Softness(**subset)
+    present = np.asarray(_touching(scene, named).friction)[:, 0]
+    if np.ptp(present) > 0:
+        listed = name_pairs(named.selected(scene.model))
+        told = f"friction of {listed} is from {present.min():g} to {present.max():g}, and becomes one number"
+        warnings.warn(f"{scene.name}: {told}: name the pairs that share one, as table/cup", SceneWarning, stacklevel=2)
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
         chosen = named.selected(model)
@@ -231,7 +241,7 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
             found["geom_friction"] = model.geom_friction.at[geoms, 0].set(value)
         return found
 
-    return _positive(float(_touching(scene, named).friction[0, 0]), bounds, write, "", "friction")
+    return _positive(float(present[0]), bounds, write, "", "friction")
 
 
 def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -> Parameter:

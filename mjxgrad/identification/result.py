@@ -61,6 +61,7 @@ class Outlook(Printed):
         num_motions: motions of all windows that it takes, about.
         num_windows: windows, each of `num_steps` steps.
         num_steps: steps of a window.
+        is_rugged: whether contacts chatter already at the nominal values: then the intervals will be wider by far.
     """
 
     coordinates: Coordinates
@@ -70,6 +71,7 @@ class Outlook(Printed):
     num_motions: int
     num_windows: int
     num_steps: int
+    is_rugged: bool = False
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return a table of text, header first: name, standard error that the recordings allow, and what it goes with."""
@@ -94,6 +96,8 @@ class Outlook(Printed):
             if lost
             else "Every number is told, at the first values:"
         )
+        if self.is_rugged:
+            told += " Contacts chatter, so that the errors will be larger than these by far:"
         return "\n".join([price, told, *(f"  {line}" for line in aligned(self.rows()))])
 
     __str__ = summary

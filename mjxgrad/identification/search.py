@@ -154,12 +154,12 @@ def outlook(
     widths = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], 0.3)
     linear = search.linear(start.point, residual, widths, problem.num_steps, 1.0)
     factors = factors_of(residual, linear.slope, linear.by_start)
-    num, more = search.price(search.is_rugged(linear, start.point, 1.0))
+    num, more = search.price(is_rugged := search.is_rugged(linear, start.point, 1.0))
     coordinates = problem.motions.coordinates
     slope = _slope(problem, factors, coordinates.nominal)
     found = statistics(coordinates, coordinates.nominal, float(problem.num_numbers), slope, problem.num_numbers, 0)
     seconds = num * search.pace, more * search.pace
-    return Outlook(coordinates, found, *seconds, int(num), problem.windows.index.shape[0], problem.num_steps)
+    return Outlook(coordinates, found, *seconds, int(num), problem.windows.index.shape[0], problem.num_steps, is_rugged)
 
 
 def _checked(

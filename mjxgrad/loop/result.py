@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mjxgrad._text import Printed, format_range
+from mjxgrad._text import Printed, format_number, format_range
 from mjxgrad.estimators import Reason
 from mjxgrad.loop.run import Progress
 
@@ -27,6 +27,8 @@ class Stopped(eqx.Enumeration):
     )
 
 
+_BEYOND = 3.0  # errors by which the last step's cost is clearly another
+_CLEARLY = 0.01  # share of a cost by which it is at least, also without noise
 # Arrays of JAX in the loop, of NumPy afterwards.
 Numbers, Counts = Float[Any, "..."], Int[Any, "..."]
 
@@ -168,13 +170,45 @@ class Optimisation(eqx.Module, Printed):
     compile_seconds: float
 
     def __str__(self) -> str:
-        steps, rollouts, skipped = (
-            format_range((float(np.min(x)), float(np.max(x))))
-            for x in (self.num_steps, self.num_rollouts, self.num_skipped)
+        steps, rollouts, skipped, best = (
+            format_range((float(np.min(x)), float(np.max(x))), between)
+            for x, between in (
+                (self.num_steps, "–"),
+                (self.num_rollouts, "–"),
+                (self.num_skipped, "–"),
+                (self.best_cost, " to "),
+            )
         )
-        cost = format_range((float(np.min(self.best_cost)), float(np.max(self.best_cost))), " to ")
+        last, error, is_worse = self._at_last()
+        last = format_range((float(last.min()), float(last.max())), " to ")
+        last += "" if np.isnan(error).all() else f" ± {format_number(float(np.nanmax(error)))}"
+        kind = "cost" if np.isfinite(self.history.noise_free_cost).any() else "mean cost under noise"
         runs = [jax.tree.map(lambda x, i=i: jnp.ravel(x)[i], self.stopped) for i in range(np.size(self.num_steps))]
         reasons = "; ".join(dict.fromkeys(Stopped[run] for run in runs))
         spent = f"{self.seconds:.3g} s, and {self.compile_seconds:.3g} s to compile"
-        text = f"Best cost {cost} after {steps} steps, {skipped} skipped: {reasons}{self.history.about_alpha}."
-        return f"{text} {rollouts} rollouts took {spent}."
+        text = f"Best {kind} {best} (best_params), at the last step {last} (params), after {steps} steps, {skipped} skipped: "
+        if is_worse.any():
+            whose = "The" if len(runs) == 1 else f"In {is_worse.sum()} of {len(runs)} runs the"
+            text = f"{whose} last step is clearly worse than the best: take result.best_params. {text}"
+        return f"{text}{reasons}{self.history.about_alpha}. {rollouts} rollouts took {spent}."
+
+    def _at_last(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return each run's last measured cost, its error (NaN without noise), and whether it is clearly above the best."""
+        best, final = (np.atleast_1d(x) for x in (self.best_cost, self.final_cost))
+        names = ("noise_free_cost", "cost", "cost_error", "scale")
+        free, cost, error, scale = (np.reshape(getattr(self.history, name), (best.size, -1)) for name in names)
+        runs, is_evaluated = np.arange(best.size), np.isfinite(free).any()
+        known = free if is_evaluated else cost
+        last = known.shape[1] - 1 - np.isfinite(known)[:, ::-1].argmax(axis=1)
+        found = np.where(np.isnan(final), known[runs, last], final)
+        off_by, room, is_alike = np.full(best.size, np.nan), 0.0, True
+        if not is_evaluated:
+            at, off_by = (
+                np.abs(np.where(np.isnan(cost), np.inf, cost) - best[:, None]).argmin(axis=1),
+                error[runs, last],
+            )
+            # The lowest of n noisy means is some √(2 ln n) errors too low.
+            room = _BEYOND * off_by + np.sqrt(2 * np.log(cost.shape[1])) * error[runs, at]
+            is_alike = scale[runs, at] == scale[runs, last]  # costs under different noise are not comparable
+        size = np.maximum(np.abs(found), np.abs(best))
+        return found, off_by, is_alike & (found - best > np.maximum(room, _CLEARLY * size))

@@ -117,7 +117,7 @@ class SceneTask(Task, InScene):
         policy_sees: the input of a policy, "state" or "observations"; see `rollout`.
     """
 
-    state: State
+    state: State = eqx.field(repr=False)
     cost: Callable[[Trajectory], Float[Array, "..."]] = eqx.field(converter=as_pytree)
     horizon: int = eqx.field(static=True, converter=functools.partial(whole, "horizon"))
     start_distribution: Callable[[PRNGKeyArray], State] | None = eqx.field(converter=as_pytree, default=None)

@@ -87,7 +87,9 @@ class Plan(eqx.Module, Printed):
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
         if not jnp.isfinite(self.iterations.promised[-1]):
             steep = "the derivatives of its steps multiply beyond all numbers"
-            return f"not improved: {steep}; give the system contact=mg.Slope(), or take a shorter plan or more smoothing"
+            return (
+                f"not improved: {steep}; give the system contact=mg.Slope(), or take a shorter plan or more smoothing"
+            )
         return "converged" if self.converged else "not converged; take more iterations"
 
     def __str__(self) -> str:
@@ -360,7 +362,9 @@ def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: 
     def spread(moved, given):
         model, change = given
         moved = model.A @ moved + model.B @ change
-        return moved, jnp.abs(moved) <= _INFLUENCE * jnp.abs(moved).max()  # of this step: later ones may grow without bounds
+        return moved, jnp.abs(moved) <= _INFLUENCE * jnp.abs(
+            moved
+        ).max()  # of this step: later ones may grow without bounds
 
     _, is_still = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models, signs.astype(slopes.dtype)))
     return (gain > _TOLERANCE * jnp.abs(cost)) & is_still.all(axis=0)

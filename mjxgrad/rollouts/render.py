@@ -163,7 +163,10 @@ def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **numbers: Number) -
     for name, value in numbers.items():
         positive(name, value)
     if positions.ndim != 2 or positions.shape[1] != mj_model.nq or not len(positions):
-        raise ValueError(f"qpos must have shape (states, nq) = (at least 1, {mj_model.nq}), got {positions.shape}")
+        is_batch = positions.ndim == 3 and positions.shape[2] == mj_model.nq
+        remedy = ": draw one motion at a time, such as qpos[0]" if is_batch else ""
+        wanted = f"shape (states, nq) = (at least 1, {mj_model.nq})"
+        raise ValueError(f"qpos must have {wanted}, got {positions.shape}{remedy}")
     if not np.isfinite(positions).all():
         bad = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
         raise ValueError(f"qpos must be finite, got a value that is not in state {bad}; draw the states before it")

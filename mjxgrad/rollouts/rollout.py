@@ -183,7 +183,7 @@ def sequence_of(
     given = {name: real(name, value) for name, value in given.items() if value is not None}
     for name, value in given.items():
         if value.ndim != 2 or value.shape[1] != num_controls:
-            raise ValueError(_unlike_rows(name, value.shape, num_controls))
+            raise ValueError(_unlike_rows(name, value.shape, num_controls, horizon))
     lengths = {name: len(value) for name, value in given.items()}
     if horizon is not None:
         lengths["horizon"] = whole("horizon", horizon)
@@ -203,7 +203,7 @@ def sequence_of(
     return given.get("controls"), horizon
 
 
-def _unlike_rows(name: str, shape: tuple[int, ...], num_controls: int) -> str:
+def _unlike_rows(name: str, shape: tuple[int, ...], num_controls: int, horizon: int | None) -> str:
     columns = {0: "no column, for there are no actuators", 1: "1 column, that of the actuator"}
     wanted = f"one row per step and {columns.get(num_controls, f'{num_controls} columns, one per actuator')}"
     remedy = ""
@@ -211,9 +211,10 @@ def _unlike_rows(name: str, shape: tuple[int, ...], num_controls: int) -> str:
         remedy = f": to hold them for a horizon take jnp.tile({name}, (horizon, 1))"
     elif len(shape) == 1 and num_controls == 1:
         remedy = f": take {name}[:, None]"
-    elif len(shape) == 2 and shape[0] == num_controls > 1:
-        remedy = ": transpose it"
-    return f"{name} must have {wanted}, got shape {shape}{remedy}"
+    elif len(shape) == 2 and shape[0] == num_controls > 1 and horizon in (None, shape[1]):
+        remedy = ": if its rows are those of actuators, transpose it"
+    length = "horizon" if horizon is None else horizon
+    return f"{name} must have {wanted}, shape ({length}, {num_controls}), got shape {shape}{remedy}"
 
 
 def started(scene: Any, state: Any) -> State:

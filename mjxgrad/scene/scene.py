@@ -80,17 +80,18 @@ class Scene(eqx.Module):
         more: numbers of the C model that MJX lacks and `with_model` changed, by MuJoCo's names, such as "geom_surfacevel".
     """
 
-    model: mjx.Model
-    data: mjx.Data
-    mj_model: mujoco.MjModel = eqx.field(static=True)
-    omissions: tuple[Omission, ...] = eqx.field(static=True)
-    conversions: tuple[Conversion, ...] = eqx.field(static=True)
-    pairs: Pairs = eqx.field(static=True)
+    # In what holds a scene it is shown by its name: equinox does not ask `__repr__` there.
+    model: mjx.Model = eqx.field(repr=False)
+    data: mjx.Data = eqx.field(repr=False)
+    mj_model: mujoco.MjModel = eqx.field(static=True, repr=False)
+    omissions: tuple[Omission, ...] = eqx.field(static=True, repr=False)
+    conversions: tuple[Conversion, ...] = eqx.field(static=True, repr=False)
+    pairs: Pairs = eqx.field(static=True, repr=False)
     name: str = eqx.field(static=True)
-    unsupported: str = eqx.field(static=True, default="")
+    unsupported: str = eqx.field(static=True, default="", repr=False)
     chosen: EngineName | None = eqx.field(static=True, default=None)
     max_contacts: int | None = eqx.field(static=True, default=None)
-    more: dict[str, Array] = eqx.field(default_factory=dict)
+    more: dict[str, Array] = eqx.field(default_factory=dict, repr=False)
 
     @property
     def engine(self) -> EngineName:

@@ -57,7 +57,9 @@ def test_bodies_whose_contact_mjx_lacks_have_constants(pair):
         engine="mujoco",
     )
     heavier = scene.with_model(body_mass=2 * scene.mj_model.body_mass)
-    np.testing.assert_allclose(heavier.model.body_invweight0[1, 0], 0.5 * scene.mj_model.body_invweight0[1, 0], rtol=1e-6)
+    np.testing.assert_allclose(
+        heavier.model.body_invweight0[1, 0], 0.5 * scene.mj_model.body_invweight0[1, 0], rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", ["hopper", "ant"])

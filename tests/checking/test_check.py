@@ -3,6 +3,7 @@
 import functools
 import importlib
 import re
+import threading
 import time
 import warnings
 
@@ -336,6 +337,32 @@ def test_an_interruption_keeps_what_was_measured(monkeypatch):
     assert order == ["prices", "derivatives"], "or Ctrl-C would wait for prices"
     assert len(measured.lines) == 1
     assert len(measured.left_out) > 3
+
+
+@pytest.mark.parametrize("part", ["random_motions", "seconds_of", "measure", "most_contacts"])
+def test_an_interruption_of_any_part_keeps_what_is_known(monkeypatch, part):
+    """What waits for C++ does so in another thread, since Python calls no handler of signals meanwhile."""
+    module, told, places = importlib.import_module("mjxgrad.checking.check"), [], []
+    own = getattr(module, part)
+
+    def interrupted(*given, **how):
+        places.append(threading.current_thread() is threading.main_thread())
+        if len(places) == 1:
+            raise KeyboardInterrupt
+        return own(*given, **how)
+
+    monkeypatch.setattr(module, part, interrupted)
+    if part == "random_motions":
+        with pytest.raises(KeyboardInterrupt):
+            mg.check(ball(), log=told.append)
+        assert "1 degree of freedom" in told[-1]
+    else:
+        verdict = mg.check(ball(), budget=2, log=told.append)
+        assert "First to touch: floor – ball" in verdict.summary()
+        stopped = "Derivatives were not measured: it was interrupted." in verdict.summary()
+        assert stopped == (part != "most_contacts"), "after all measurements nothing is lost"
+        assert ("measuring derivatives by C MuJoCo" in told) == (part != "seconds_of")
+    assert places[0] == (part in ("measure", "most_contacts"))  # these wait themselves, or are Python
 
 
 def test_derivatives_along_a_line_are_those_of_a_rollout():

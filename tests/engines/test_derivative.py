@@ -192,6 +192,16 @@ def test_second_derivatives_are_refused_by_name(pushed):
         jax.hessian(lambda k: end(at | {"stiffness": k}))(at["stiffness"])
 
 
+def test_second_derivatives_are_not_promised_by_an_engine_that_lacks_the_scene():
+    """MJX has no collision of a cylinder with a box."""
+    geoms = "<geom type='box' size='1 1 .1'/><body pos='0 0 1'><freejoint/><geom type='cylinder' size='.1 .1'/></body>"
+    scene = mg.load_scene(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>", engine="mujoco")
+    end = lambda v: mg.rollout(scene, mg.initial_state(scene, qvel=v), horizon=2).qpos[-1, 0]  # noqa: E731
+    with pytest.raises(ValueError, match=r"alone: this scene has no second ones: .*cannot be stepped by MJX") as told:
+        jax.hessian(end)(jnp.zeros(6))
+    assert "engine" not in str(told.value)
+
+
 def test_a_model_that_is_differentiated_is_left_as_it_was(pushed, programs):
     (at, _), (value, slopes) = pushed, programs
     before = value(at)
@@ -301,7 +311,7 @@ def test_differences_do_not_step_over_a_jump_that_is_no_contact_at_the_start(gap
 def test_a_bottle_that_stands_on_a_table_is_turned_by_its_weight_and_not_by_which_points_touch():
     """The four points of its rim that touch are others after every turn, a jump of 3 mrad/s: differences of 1 µrad have 3000 1/s.
 
-    Over its rim such a bottle turns back as those of 1 mrad say, about which the contact is as it is; fifty steps multiply nothing.
+    It turns back as those of 1 mrad say, about which the contact is as it is, and fifty steps multiply nothing.
     """
     xml = """<mujoco><option timestep=".004" integrator="implicitfast" cone="elliptic"/><worldbody>
         <geom type="box" size=".5 .5 .02" pos="0 0 -.02"/>

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjxgrad.engines import jacobians
+from mjxgrad.engines import inverse, jacobians
 from mjxgrad.engines.pool import Pool
 from tests.engines.whole_steps import by_whole_steps
 
@@ -166,3 +166,12 @@ def test_a_step_whose_solver_finds_no_end_takes_no_whole_steps(monkeypatch):
     )
     assert np.isfinite(found["state"]).all()
     assert np.abs(found["state"]).max() > 0
+
+
+def test_a_motion_that_diverges_ends_in_no_error():
+    """Of accelerations of 1e12 rad/s² those that a difference adds are lost, so that a row of its derivative is zero."""
+    model = _model("Euler", "", "", "", "")
+    engine = Pool(model)
+    by, row = inverse.Inverse(model, engine.layout), np.zeros(engine.layout.size)
+    found = by.solutions(row, np.zeros(2), np.diag([1.0, 0.0]), np.zeros((1, 2)))
+    assert np.isfinite(found).all()

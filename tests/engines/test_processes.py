@@ -106,6 +106,14 @@ def test_one_whose_parent_was_killed_ends_in_silence():
     assert run_python("-c", ask) == ("", "")  # waits until the child has closed its output
 
 
+def test_one_whose_parent_ends_within_a_question_ends_in_silence():
+    """As Ctrl-C does: half a question is no question, and no reason for a traceback."""
+    ask = "import os, pickle; from mjxgrad.engines.processes import Processes; child = Processes(1).children[0]; "
+    ask += "question = pickle.dumps((0, None, bytes(10**6)), pickle.HIGHEST_PROTOCOL); "
+    ask += "child.stdin.write(question[: len(question) // 2]); child.stdin.flush(); os._exit(0)"
+    assert run_python("-c", ask) == ("", "")
+
+
 def test_a_function_of_this_process_in_a_step_keeps_it_here():
     assert are_possible()
     mujoco.set_mjcb_control(lambda model, data: None)

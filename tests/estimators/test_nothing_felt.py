@@ -49,6 +49,15 @@ def test_a_dead_zone_is_named_and_its_edge_is_not(name):
     assert np.all(np.asarray(estimate.alpha)[0] == (1 if name == "first_order" else 0))
 
 
+@pytest.mark.parametrize(("slope", "is_felt"), [(1e-20, False), (1e-3, True)])
+def test_a_gradient_of_rounding_is_said_to_be_none(key, slope, is_felt):
+    """As a solver leaves it on what nothing touches; costs scatter there by its tolerance, which is felt by zeroth order."""
+    objective = mg.parameter_noise(lambda x: 0.5 + slope * jnp.cos(x).sum(), 0.1)
+    told = str(estimators.alpha_order(objective, jnp.ones(8), key, num_samples=16))
+    assert ("nothing is felt: the cost does not depend on what is moved, or only by jumps" in told) != is_felt
+    assert ("no bias was found" in told) == is_felt
+
+
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_an_optimum_is_felt(name):
     """Costs differ under noise, be it small, and so do derivatives; also where all costs round to the same number."""

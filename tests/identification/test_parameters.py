@@ -1,5 +1,7 @@
 """Parameters: bounds as coordinates, makers that write what they say, and inertias as ten numbers."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,6 +21,7 @@ from mjxgrad.identification.parameters import (
     second_moments,
     write_all,
 )
+from mjxgrad.scene import SceneWarning
 
 _SCENE = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1" friction=".4"/>
   <body name="arm" pos="0 0 1"><joint name="hinge" axis="0 1 0" damping="2" armature=".3"/>
@@ -176,3 +179,15 @@ def test_the_inertia_of_a_body_begins_where_the_model_is(scene):
         np.testing.assert_allclose(
             getattr(changed.model, name), getattr(scene.model, name), rtol=1e-6, atol=1e-9, err_msg=name
         )
+
+
+def test_contacts_that_differ_and_become_alike_are_told():
+    scene = mg.load_scene("""<mujoco><worldbody><geom name="table" type="plane" size="1 1 .1" friction=".8"/>
+      <body pos="0 0 .1"><freejoint/><geom name="cup" size=".1" friction=".5"/></body>
+      <body pos="0 .3 .1"><freejoint/><geom name="finger" size=".1"/></body></worldbody></mujoco>""")
+    told = r"the MJCF: friction of table – cup \+ 2 more is from 0.8 to 1, and becomes one number: name the pairs that share one"
+    with pytest.warns(SceneWarning, match=told):
+        identification.friction(scene, geoms=("table", "cup"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        identification.friction(scene, pairs=(("table", "cup"),))

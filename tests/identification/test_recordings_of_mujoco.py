@@ -57,6 +57,17 @@ def _assert_intervals_hold(xml: str, recordings: list[identification.Recording],
     assert (np.sum(held, axis=0) >= 17).all()
 
 
+@pytest.mark.parametrize(("contact", "chatters"), [(_SOFT, False), ("", True)], ids=["soft contact", "default contact"])
+def test_it_is_foretold_that_contacts_chatter(contact, chatters):
+    xml = _BOX.format(contact, "")
+    scene, true = mg.load_scene(xml, keep_everything=True), _states(xml, _CONTROLS)[1]
+    start = mg.initial_state(scene)
+    one = identification.Recording({"qvel": true}, _CONTROLS, noise={"qvel": _NOISE}, start=start)
+    found = identification.outlook(scene, {"friction": identification.friction(scene)}, [one])
+    assert found.is_rugged == chatters
+    assert ("Contacts chatter, so that the errors will be larger than these by far:" in found.summary()) == chatters
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("contact", "turn", "is_exact"),

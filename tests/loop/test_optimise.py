@@ -130,9 +130,55 @@ def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
 def test_a_result_is_shown_as_a_sentence(zeroth_order_run):
     """By `print`, and by IPython as a notebook does."""
     assert pretty(zeroth_order_run) == str(zeroth_order_run)
-    assert str(zeroth_order_run).startswith(
-        f"Best cost {float(zeroth_order_run.best_cost):.4g} after 250 steps, 0 skipped: all steps were done"
+    best, last = (float(x) for x in (zeroth_order_run.best_cost, zeroth_order_run.final_cost))
+    costs = f"Best cost {best:.4g} (best_params), at the last step {last:.4g} (params)"
+    assert f"{costs}, after 250 steps, 0 skipped: all steps were done" in str(zeroth_order_run)
+
+
+WORSE = "last step is clearly worse than the best: take result.best_params."
+
+
+@pytest.mark.parametrize(("error", "is_worse"), [(0.01, True), (100.0, False)])
+def test_a_last_step_that_is_worse_beyond_its_error_is_said_first(key, error, is_worse):
+    """Uphill on the bowl, from 9.875 to 77.55 = (1.1⁸ + 3 · 2.5² · 1.3⁸) / 2 before the fifth step."""
+
+    def uphill(objective, params, key):
+        return made_up(-CURVATURE * (params - CENTRE), cost=problems.bowl(params), cost_error=error)
+
+    told = str(run(key, uphill, num_steps=5))
+    assert (
+        told.startswith(f"The {WORSE} Best mean cost under noise 9.875 (best_params), at the last step 77.55")
+        == is_worse
     )
+    assert (WORSE in told) == is_worse
+    both = str(run(jax.random.split(key), uphill, num_steps=5))
+    assert both.startswith(f"In 2 of 2 runs the {WORSE}") == is_worse
+    assert f" ± {error:g} (params)" in told
+    # Without noise there is no error, and under other noise nothing to compare.
+    assert str(run(key, uphill, num_steps=5, evaluate=problems.bowl)).startswith(
+        f"The {WORSE} Best cost 9.875 (best_params)"
+    )
+    annealed = mg.optimise(
+        lambda scale: problems.objective,
+        START,
+        key,
+        estimator=uphill,
+        optimiser=SGD,
+        num_steps=5,
+        annealing=lambda step: 0.5**step,
+    )
+    assert WORSE not in str(annealed)
+
+
+def test_a_last_step_that_is_worse_by_luck_is_no_worse(key):
+    """Two hundred costs of nothing but noise: the lowest is some three errors below the last one."""
+
+    def still(objective, params, key):
+        return made_up(jnp.zeros(2), cost=1.0 + 0.1 * jax.random.normal(key), cost_error=0.1)
+
+    found = run(jax.random.split(key, 20), still, num_steps=200)
+    assert np.max(found.history.cost[:, -1] - found.best_cost) > 3 * np.hypot(0.1, 0.1)
+    assert WORSE not in str(found)
 
 
 @pytest.mark.parametrize("settings", [{"num_steps": 3}, {"patience": 4}])

@@ -35,6 +35,15 @@ def test_mirrored_and_redrawn_noise_begins_at_the_same_place(objective, key):
     assert np.abs(other - noise).min() > 0
 
 
+def test_a_task_is_shown_in_a_few_lines():
+    """A scene within anything is its name, not its model of hundreds of fields."""
+    scene = load_scene("<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody></mujoco>")
+    lines = repr(SceneTask(scene, initial_state(scene), lambda course: course.qpos[-1, 0], 7)).splitlines()
+    assert len(lines) < 10
+    assert lines[1].strip() == "scene=Scene(name='the MJCF'),"
+    assert lines[-2].strip() == "horizon=7"
+
+
 def test_zero_noise_takes_the_nominal_start(objective, params):
     fixed = eqx.tree_at(lambda o: o.task, objective, textbook.LinearSystem())
     assert objective.value(params, objective.zero_noise()) == fixed.value(params, fixed.zero_noise())

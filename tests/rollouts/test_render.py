@@ -82,7 +82,7 @@ def test_a_picture_may_be_larger_than_the_scene_says_and_the_scene_is_left_alone
     ("qpos", "settings", "sentence"),
     [
         (np.zeros((3, 2)), {}, r"qpos must have shape \(states, nq\) = \(at least 1, 1\), got \(3, 2\)"),
-        (np.zeros((0, 1)), {}, r"got \(0, 1\)"),
+        (np.zeros((0, 1)), {}, r"got \(0, 1\)$"),
         (np.array([[0.0], [np.nan]]), {}, "not in state 1"),
         (np.zeros((3, 1)), {"fps": 0.0}, "fps must be positive, got 0.0"),
         (np.zeros((3, 1)), {"speed": -1.0}, "speed must be positive, got -1.0"),

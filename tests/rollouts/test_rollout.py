@@ -1,6 +1,7 @@
 """Rollouts: what is kept, what is flagged, what is refused."""
 
 import dataclasses
+import re
 import warnings
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad.rollouts.rollout import sequence_of
 from mjxgrad.scene import SceneWarning
 
 PUSHED = """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><geom type="plane" size="1 1 1"/>
@@ -38,6 +40,42 @@ def _positions(forces):
     """Semi-implicit Euler in closed form: v_k = h Σ f/m, x_k = h Σ v."""
     velocity = np.cumsum(H * GEAR * np.asarray(forces) / MASS)
     return np.concatenate([[0], np.cumsum(H * velocity)])
+
+
+@pytest.mark.parametrize(
+    ("shape", "horizon", "told"),
+    [
+        ((2, 3), None, "shape (horizon, 2), got shape (2, 3): if its rows are those of actuators, transpose it"),
+        ((2, 3), 3, "shape (3, 2), got shape (2, 3): if its rows are those of actuators, transpose it"),
+        ((2, 3), 2, "shape (2, 2), got shape (2, 3)"),
+        ((3, 3), None, "shape (horizon, 2), got shape (3, 3)"),
+    ],
+)
+def test_transposing_is_proposed_where_it_would_fit(shape, horizon, told):
+    with pytest.raises(ValueError, match=f"{re.escape(told)}$"):
+        sequence_of(jnp.zeros(shape), None, horizon, 2)
+
+
+def test_a_trajectory_is_shown_with_the_numbers_that_are_known(scene, controls):
+    """Six steps of 0.01 s; what pairs a slope follows is an engine's own. Traced numbers have a form alone."""
+    shown = []
+
+    @jax.jit
+    def rolled(u):
+        course = mg.rollout(scene, mg.initial_state(scene), u, measure_growth=True)
+        shown.append(repr(course))
+        return course
+
+    course = rolled(controls)
+    shown.append(repr(course))
+    for name, value in {"diverged": "False", "first_bad_step": "-1", "crowded": "0", "time": "0.06"}.items():
+        assert f"{name}={value}," in shown[1]
+        assert f"{name}={value}," not in shown[0]
+    assert f"growth={float(course.growth):.4g}," in shown[1]
+    assert "diverged=bool[]," in shown[0]
+    assert "qpos=f64[7,2]," in shown[1]
+    stepped = scene.with_engine("mujoco")
+    assert "pairs" not in repr(mg.rollout(stepped, mg.initial_state(stepped), controls))
 
 
 def test_states_before_each_step_and_after_the_last_are_those_of_controls_and_noise(roll, controls):
