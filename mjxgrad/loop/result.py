@@ -170,17 +170,10 @@ class Optimisation(eqx.Module, Printed):
     compile_seconds: float
 
     def __str__(self) -> str:
-        steps, rollouts, skipped, best = (
-            format_range((float(np.min(x)), float(np.max(x))), between)
-            for x, between in (
-                (self.num_steps, "–"),
-                (self.num_rollouts, "–"),
-                (self.num_skipped, "–"),
-                (self.best_cost, " to "),
-            )
-        )
+        span = lambda x, *between: format_range((float(np.min(x)), float(np.max(x))), *between)  # noqa: E731
+        steps, rollouts, skipped = map(span, (self.num_steps, self.num_rollouts, self.num_skipped))
         last, error, is_worse = self._at_last()
-        last = format_range((float(last.min()), float(last.max())), " to ")
+        best, last = span(self.best_cost, " to "), span(last, " to ")
         last += "" if np.isnan(error).all() else f" ± {format_number(float(np.nanmax(error)))}"
         kind = "cost" if np.isfinite(self.history.noise_free_cost).any() else "mean cost under noise"
         runs = [jax.tree.map(lambda x, i=i: jnp.ravel(x)[i], self.stopped) for i in range(np.size(self.num_steps))]
@@ -203,10 +196,8 @@ class Optimisation(eqx.Module, Printed):
         found = np.where(np.isnan(final), known[runs, last], final)
         off_by, room, is_alike = np.full(best.size, np.nan), 0.0, True
         if not is_evaluated:
-            at, off_by = (
-                np.abs(np.where(np.isnan(cost), np.inf, cost) - best[:, None]).argmin(axis=1),
-                error[runs, last],
-            )
+            at = np.abs(np.where(np.isnan(cost), np.inf, cost) - best[:, None]).argmin(axis=1)
+            off_by = error[runs, last]
             # The lowest of n noisy means is some √(2 ln n) errors too low.
             room = _BEYOND * off_by + np.sqrt(2 * np.log(cost.shape[1])) * error[runs, at]
             is_alike = scale[runs, at] == scale[runs, last]  # costs under different noise are not comparable

@@ -362,9 +362,8 @@ def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: 
     def spread(moved, given):
         model, change = given
         moved = model.A @ moved + model.B @ change
-        return moved, jnp.abs(moved) <= _INFLUENCE * jnp.abs(
-            moved
-        ).max()  # of this step: later ones may grow without bounds
+        size = jnp.abs(moved)
+        return moved, size <= _INFLUENCE * size.max()  # of this step: later ones may grow without bounds
 
     _, is_still = jax.lax.scan(spread, jnp.zeros_like(slopes[0]), (models, signs.astype(slopes.dtype)))
     return (gain > _TOLERANCE * jnp.abs(cost)) & is_still.all(axis=0)

@@ -112,3 +112,17 @@ def test_the_start_is_as_noisy_as_the_first_row_that_gives_it():
         counted, np.tile([0, 1000, 1000], (3, 1))
     )  # the first row is the start, and no measurement
     np.testing.assert_array_equal(spread(scene, [one], False), [0 * measured])
+
+
+def test_an_ensemble_that_got_too_wide_narrows_again():
+    """The mean of a wide one explains less than that of the first, so that wider ones would explain ever less."""
+    linear, *_ = _problem(1.0, 0.0, np.random.default_rng(0))
+    apart, widths = np.random.default_rng(1).normal(size=(_WINDOWS, _NUMBERS)), []
+
+    def motions(values, starts):
+        widths.append(values.std())
+        return linear(values, starts) + (2.0 + 20.0 * widths[-1]) * apart
+
+    point, first = (np.zeros(2), np.zeros((_WINDOWS, 3))), (np.full(2, 0.3), np.ones((_WINDOWS, 3)))
+    fit(motions, point, first, (np.full(2, -1e9), np.full(2, 1e9)), 1.0, 120, lambda *_: None)
+    assert max(widths) < 10 * widths[0]

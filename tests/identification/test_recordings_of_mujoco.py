@@ -41,10 +41,7 @@ def _states(xml: str, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _assert_intervals_hold(xml: str, recordings: list[identification.Recording], may_stall: bool) -> None:
-    """Of 20 intervals that hold with 95 %, 16 or more do with a chance of 99.7 %, all 16 such counts of this file with 96 %.
-
-    `pytest -s` shows the counts.
-    """
+    """Of 20 intervals that hold with 95 %, 17 or more do with a chance of 98 %; `pytest -s` shows the counts."""
     scene, held, halves = mg.load_scene(xml, keep_everything=True), [], []
     parameters = {"friction": identification.friction(scene), "mass": identification.mass(scene, "box")}
     for recording in recordings:
@@ -57,7 +54,7 @@ def _assert_intervals_hold(xml: str, recordings: list[identification.Recording],
     print(
         f"\nfriction and mass hold {np.sum(held, axis=0)} of {len(held)}, median half widths {np.round(100 * share, 2)} %"
     )
-    assert (np.sum(held, axis=0) >= 16).all()
+    assert (np.sum(held, axis=0) >= 17).all()
 
 
 @pytest.mark.parametrize(("contact", "chatters"), [(_SOFT, False), ("", True)], ids=["soft contact", "default contact"])
