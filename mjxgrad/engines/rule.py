@@ -202,7 +202,7 @@ def _once(
     @call.defjvp
     def _refuse(primals, tangents):
         remedy = 'for second ones take engine "mjx"'
-        lack = scene.unsupported and f"this scene has no second ones: {scene.unsupported}"
+        lack = scene.unsupported and f"for second ones MJX must step the scene: {scene.unsupported}"
         raise ValueError(f"C MuJoCo has first derivatives alone: {lack or remedy}")
 
     return call(*arguments)
