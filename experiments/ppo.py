@@ -15,7 +15,7 @@ from mjxgrad.envs import Environment
 
 _READINGS = 20
 # Brax's own numbers for its half_cheetah with a longer discount, with which ants learn three times as much as with its ant's;
-# hoppers' are those of MuJoCo Playground for dm_control, quadrupeds' those for its Go1.
+# hoppers' and walkers' are those of MuJoCo Playground for dm_control, quadrupeds' those for its Go1.
 _HOW = {
     "num_envs": 2048,
     "unroll_length": 20,
@@ -35,6 +35,7 @@ _OWN: dict[str, dict[str, Any]] = {
     "quadruped": {"num_envs": 8192, "batch_size": 256, "num_updates_per_batch": 4, "discounting": 0.97}
     | {"entropy_cost": 1e-2, "max_grad_norm": 1.0},
 }
+_OWN["walker2d"] = _OWN["hopper"]
 _LAYERS = {"quadruped": dict.fromkeys(["policy_hidden_layer_sizes", "value_hidden_layer_sizes"], (512, 256, 128))}
 
 Act = Callable[[Any, Float[Array, " obs"]], Float[Array, " nu"]]
@@ -50,7 +51,7 @@ def learn_ppo(
     left out, and `reward`, the mean per step of whole episodes then.
     """
     ppo, networks, environment_of_brax = load()
-    how = _HOW | _OWN.get(name, {})
+    how = numbers_of(name)
     # A part between two readings has a batch at least.
     num_batches = num_steps // math.prod(how[each] for each in ("batch_size", "num_minibatches", "unroll_length"))
     readings: list[tuple[float, float, float]] = []
@@ -83,6 +84,11 @@ def learn_ppo(
         return make_policy(params, deterministic=True)(obs, jax.random.key(0))[0]
 
     return params, act, {"steps": steps, "seconds": seconds, "reward": reward}
+
+
+def numbers_of(name: str) -> dict[str, Any]:
+    """Return PPO's numbers for a robot; gymnasium's (`_v5`) have those of their kind."""
+    return _HOW | _OWN.get(name.removesuffix("_v5"), {})
 
 
 def load() -> tuple[Any, Any, Any]:
