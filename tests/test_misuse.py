@@ -415,6 +415,8 @@ FOUND = {
     "mg.learning.learn(cart, key, num_updates=1, settings={})": "settings must be of mg.learning.Settings, got dict",
     "mg.learning.learn(cart, key, num_updates=1, checkpoint='/no/x.npz')": "checkpoint must be in a folder that exists",
     "planned(controls=np.full((3, 2), np.nan))": "controls must be finite",
+    "planned(num_samples=2.5)": "num_samples must be a whole number, got 2.5",
+    "planned(num_samples=2, stddev=-1.0)": "stddev must be at least 0 and finite, got [-1. -1.]",
     "planned(smoother='exact')": "smoother must be one of mg.planning, such as Exact()",
     "planning.SceneSystem(scene, num_substeps=2.5)": "num_substeps must be a whole number, got 2.5",
     "planning.GoalCost(jnp.zeros(2), jnp.ones(3), 1.0, 0.1).stage(system, jnp.zeros(2), jnp.zeros(2))":

@@ -136,6 +136,8 @@ class Worker:
         mujoco.mj_setState(self.model, data, row, EVERY)
         for by_state, by_control in zip(A, B, strict=True):
             mujoco.mjd_transitionFD(self.model, data, _ONE_SIDE, False, by_state, by_control, None, None)
+            if self._is_steep(by_state):
+                return False
             mujoco.mj_step(self.model, data)
         matrix = np.eye(size, size + self.model.nu)
         for by_state, by_control in zip(A, B, strict=True):
@@ -144,7 +146,7 @@ class Worker:
         mujoco.mj_getState(self.model, data, end := np.empty_like(row), EVERY)
         found["state"][:], found["ctrl"][:] = np.split(matrix, [size], axis=1)
         found["end"][:] = end[self.layout.motion]
-        return bool(np.isfinite(end).all()) and not self._is_steep(A)
+        return bool(np.isfinite(end).all())
 
     def _together(self, steps: Steps, index: list[int]) -> None:
         """Write the derivatives of rows of one model: differences one by one, the algebra at once."""
@@ -250,7 +252,7 @@ class Worker:
         if one.is_explicit and self._is_steep(matrix):
             columns = np.flatnonzero(~(self._steepness(matrix) <= _NEARLY * _STEEP / self.model.opt.timestep))
             others = matrix.copy()
-            others[:, columns] = self._smooth(one, np.eye(nv, len(matrix))[columns], self._width(one)).T
+            others[:, columns] = self._smooth(one, np.eye(nv, len(matrix))[columns], self._width(one), at_once=True).T
             if self._steepness(others).max() < 0.5 * self._steepness(matrix).max():
                 matrix[:] = others
 
@@ -354,34 +356,47 @@ class Worker:
         """Return the width of differences of whole steps."""
         return WIDTH if one.near is None or not len(one.near.rough) or self.surfaces.has_stages else _RUBBING
 
-    def _smooth(self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float) -> np.ndarray:
+    def _smooth(
+        self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float, *, at_once: bool = False
+    ) -> np.ndarray:
         """Return differences along directions, over one side where the other has a jump, and narrower or wider where both have.
 
         A surface that is near has one jump. The points at which a bottle stands on a table jump with every turn: then all are
-        averaged over.
+        averaged over. All widths `at_once` take less time where several are needed.
         """
         # A stage of Runge-Kutta may meet a surface that the start is far from.
         is_own = one.clear is one.before and one.by is self.inverse
         middle = one.after if is_own else self._step(one.by, one.clear)
-        found, sizes = np.zeros_like(directions), np.full(len(directions), np.inf)
-        left, had_jump, signs = np.arange(len(sizes)), np.zeros(len(sizes), bool), np.array([1.0, -1.0])
         wider = (_WIDER, _WIDER**2) if width < _RUBBING else ()
-        for factor in (1.0, _NARROWER, _NARROWER**2, *wider):
-            starts = self.layout.moved(one.clear, factor * width * signs[:, None] * directions[left, None])
-            ends = self._steps(one.by, starts)
-            sides = self.layout.difference(ends, middle) * signs[:, None] / (factor * width)
+        factors, steepest = (1.0, _NARROWER, _NARROWER**2, *wider), 1 / self.model.opt.timestep
+        found, sizes = np.zeros_like(directions), np.full(len(directions), np.inf)
+        left, had_jump = np.arange(len(sizes)), np.zeros(len(sizes), bool)
+        every = self._sides(one, middle, directions, width * np.array(factors)) if at_once else None
+        for number, factor in enumerate(factors):
+            if every is not None:
+                sides = every[number, left]
+            else:
+                (sides,) = self._sides(one, middle, directions[left], width * np.array([factor]))
             both, size = np.linalg.norm(sides, axis=2), np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1)
-            jumps = (size > APART * both.max(axis=1)) & (both.max(axis=1) > 1 / self.model.opt.timestep)
+            jumps = (size > APART * both.max(axis=1)) & (both.max(axis=1) > steepest)
             least = np.take_along_axis(sides, both.argmin(axis=1)[:, None, None], axis=1)[:, 0]
             chosen = np.where(jumps[:, None], least, sides.mean(axis=1))
             size = np.linalg.norm(chosen, axis=1)
             is_better = (size < 0.5 * sizes[left]) | (had_jump[left] & ~jumps)
             index = left[is_better]
             found[index], sizes[index], had_jump[index] = chosen[is_better], size[is_better], jumps[is_better]
-            left = left[jumps | (size > 1 / self.model.opt.timestep) | (factor > 1.0)]
+            left = left[jumps | (size > steepest) | (factor > 1.0)]
             if not left.size:
                 break
         return found
+
+    def _sides(
+        self, one: _Row, middle: np.ndarray, directions: Float[np.ndarray, "columns changes"], widths: np.ndarray
+    ) -> Float[np.ndarray, "widths columns 2 changes"]:
+        """Return differences along directions to either side."""
+        changes = widths[:, None, None, None] * np.array([[1.0], [-1.0]])
+        ends = self._steps(one.by, self.layout.moved(one.clear, changes * directions[:, None]))
+        return self.layout.difference(ends, middle) / changes
 
     def _between(self, one: _Row, starts: Float[np.ndarray, "columns 2 size"], widths: np.ndarray) -> np.ndarray:
         ends = self._steps(one.by, starts)
@@ -524,7 +539,7 @@ class Worker:
         change = (after - before) / (last - first if last != first else 1.0)
         return events.weights @ change[events.index]
 
-    def _steps(self, by: Inverse, starts: Float[np.ndarray, "columns 2 size"]) -> np.ndarray:
+    def _steps(self, by: Inverse, starts: Float[np.ndarray, "... size"]) -> np.ndarray:
         rows = starts.reshape(-1, starts.shape[-1])
         return self.stepper(rows, [by.model] * len(rows)).reshape(starts.shape)
 

@@ -19,10 +19,9 @@ from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
 from mjxgrad.planning.linear_model import Exact, Smoother
 from mjxgrad.planning.system import Cost, SceneSystem, System
-from mjxgrad.planning.trajectory import Course, Problem, per_control, posed
+from mjxgrad.planning.trajectory import Course, Problem, deviations, posed, random_changes
 from mjxgrad.rollouts import State
 
-_PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first plan has
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
 _RECENT, _QUANTILE = 20, 0.9  # a part is expected to take what so large a share of its last times stays below
 _SHARE = 0.25  # of a deadline that linear models may take between two looks at the clock
@@ -60,7 +59,7 @@ class Controller(Printed):
         schedule: Sequence[float] | Float[ArrayLike, " iterations"] = (1.0,),
         first_schedule: Sequence[float] | Float[ArrayLike, " first"] | None = None,
         num_samples: int = 0,
-        stddev: ArrayLike = 0.1,
+        stddev: ArrayLike | None = None,
         deadline: float | None = None,
         lower: ArrayLike | None = None,
         upper: ArrayLike | None = None,
@@ -74,10 +73,8 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            num_samples: plans with random changes that are tried beside the step lengths: they find what derivatives do not
-                see, such as a touch from afar.
-            stddev: standard deviation of these changes, in units of the controls, a number or one per control. Each plan has
-                a share of it, from an eighth to all.
+            num_samples: plans with random changes that are tried beside the step lengths; see `optimise_trajectory`.
+            stddev: standard deviation of these changes.
             deadline: the time of a decision (s); one part of an iteration is taken at least. Where it is shorter than an
                 iteration more is compiled, to foretell from plans of two lengths what fits.
             lower: lower limits of the controls.
@@ -96,9 +93,7 @@ class Controller(Printed):
         given = system, cost, None, controls, jax.random.key(0), smoother, both, lower, upper
         problem, _, start, factors = posed(*given)
         self._schedules, self._origin = [np.asarray(one) for one in factors], np.asarray(system.origin)
-        self.stddev = np.asarray(per_control("stddev", stddev, system, self._origin.dtype))
-        if not ((self.stddev >= 0) & (self.stddev < np.inf)).all():
-            raise ValueError(f"stddev must be at least 0 and finite, got {self.stddev}")
+        self.stddev = deviations(stddev, problem)
         self.system, self._cost, self.deadline = system, cost, deadline
         self._iteration = self._prepared(problem, start)
         self.compile_seconds = self._iteration.compile_seconds
@@ -231,11 +226,8 @@ class Controller(Printed):
         return recent[int(_QUANTILE * len(recent))] if recent else 0.0
 
     def _noise(self, seed: int, horizon: int) -> Float[np.ndarray, "N horizon m"]:
-        """Return changes of the controls, each held for a quarter of the plan, and each plan's larger than the last one's."""
-        size = self.system.num_controls
-        sizes = np.geomspace(_SMALLEST, 1, self.num_samples)[:, None, None] * self.stddev
-        noise = sizes * np.random.default_rng(seed).normal(size=(self.num_samples, _PIECES, size))
-        return np.repeat(noise, -(-horizon // _PIECES), axis=1)[:, :horizon].astype(self._origin.dtype)
+        key = jax.random.key(seed)
+        return np.asarray(random_changes(key, self.stddev, self.num_samples, horizon))
 
     def _vector(self, state: Any) -> Float[np.ndarray, " state"]:
         parts = [getattr(state, name) for name in ("qpos", "qvel", "act")] if hasattr(state, "qpos") else [state]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, Real
 
-from mjxgrad._arrays import instance, is_known, known, one_key, real, traceable
+from mjxgrad._arrays import instance, is_known, known, one_key, real, traceable, whole
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
@@ -32,6 +32,10 @@ _INFLUENCE = 1e-5
 # Most Newton steps of the projected method. Each fixes further active bounds, or shortens the step by backtracking.
 _NEWTON_STEPS = 12
 _SHORTENING = 0.5 ** np.arange(8)
+_PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first one has
+_USUAL = 0.05  # of a control's range, and _UNLIMITED where it has none: the deviation of random changes
+_UNLIMITED = 0.1
+_KEPT = 0.2  # of what linear models promised; where less came true, random changes are advised
 
 
 class Iterations(eqx.Module):
@@ -41,7 +45,7 @@ class Iterations(eqx.Module):
         factor: factor of the smoothing under which the step was computed.
         smoothed_cost: cost of the smoothed system after the iteration, under the next iteration's smoothing.
         cost: cost of the system itself under the same controls, infinite if it diverged.
-        step: accepted step length, 0 if none lowered the smoothed cost.
+        step: accepted step length, 0 if none lowered the smoothed cost as much as the given plan or a random change of it.
         promised: decrease of the smoothed cost that the model predicts for a full step.
     """
 
@@ -81,7 +85,8 @@ class Plan(eqx.Module, Printed):
         if self.unmoved.any():
             return (
                 f"nothing is touched: no control moves the coordinates {np.flatnonzero(self.unmoved).tolist()} of the state, "
-                "which have a cost, so derivatives are zero; start with controls that touch, or smooth by Analytic"
+                "which have a cost, so derivatives are zero; start with controls that touch, take num_samples=32, or smooth "
+                "by Analytic"
             )
         if self.diverged:
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
@@ -90,7 +95,17 @@ class Plan(eqx.Module, Printed):
             return (
                 f"not improved: {steep}; give the system contact=mg.Slope(), or take a shorter plan or more smoothing"
             )
-        return "converged" if self.converged else "not converged; take more iterations"
+        if self.converged:
+            return "converged"
+        if (share := self._kept()) < _KEPT:
+            came = f"{100 * max(share, 0.0):.2g}% of what linear models promised came true"
+            return f"not converged: {came}, as where contacts begin and end; take num_samples=32, or more smoothing"
+        return "not converged; take more iterations"
+
+    def _kept(self) -> float:
+        """Return which share of the promised decreases came true."""
+        costs, promised = np.asarray(self.iterations.smoothed_cost), np.asarray(self.iterations.promised)
+        return float((costs[0] - costs[-1]) / max(promised[1:].sum(), np.finfo(float).tiny)) if len(costs) > 1 else 1.0
 
     def __str__(self) -> str:
         if is_traced(self.cost) or self.cost.ndim:
@@ -212,6 +227,16 @@ class Problem(eqx.Module):
         return dataclasses.replace(search, course=course, best=best, regularisation=after), true.cost, steps[index]
 
 
+@functools.partial(jax.jit, static_argnames=("num_samples", "horizon"))
+def random_changes(
+    key: PRNGKeyArray, stddev: ControlVector, num_samples: int, horizon: int
+) -> Float[Array, "N horizon m"]:
+    """Return changes of the controls, each held for a quarter of the plan, and each plan's larger than the last one's."""
+    sizes = jnp.geomspace(_SMALLEST, 1, num_samples, dtype=stddev.dtype)[:, None, None] * stddev
+    held = sizes * jax.random.normal(key, (num_samples, _PIECES, stddev.size), stddev.dtype)
+    return jnp.repeat(held, -(-horizon // _PIECES), axis=1)[:, :horizon]
+
+
 def optimise_trajectory(
     system: System,
     cost: Cost,
@@ -221,6 +246,8 @@ def optimise_trajectory(
     *,
     smoother: Smoother,
     schedule: Float[ArrayLike, " iterations"],
+    num_samples: int = 0,
+    stddev: ArrayLike | None = None,
     lower: ArrayLike | None = None,
     upper: ArrayLike | None = None,
 ) -> Plan:
@@ -235,9 +262,13 @@ def optimise_trajectory(
         cost: the cost to be minimised.
         start: the first state.
         controls: initial controls, one row per step; clipped to the limits.
-        key: consumed here. All iterations use the same noise, so that costs can be compared.
+        key: consumed here. All iterations use the same noise of the smoother, so that costs can be compared.
         smoother: the smoother of the linear models at factor 1; `Exact()` is plain iLQR.
         schedule: positive factor of the smoothing in each iteration; it should fall until the smoothed course is the true one.
+        num_samples: plans with random changes that are tried beside the step lengths in each iteration. They find what
+            derivatives do not see, and go on where linear models hold for tiny steps alone, as where an object may topple.
+        stddev: standard deviation of these changes, in units of the controls, a number or one per control; each plan has a
+            share of it, from an eighth to all. None takes a twentieth of the range between the limits, 0.1 without any.
         lower: lower limits of the controls, a number or one per control; None takes the actuators' own, `ctrlrange`.
         upper: upper limits of the controls, as `lower`.
 
@@ -256,9 +287,11 @@ def optimise_trajectory(
         smoothed models; its trajectories are those of the system itself, here the smoothed ones of a decreasing smoothing).
     """
     one_key(key)
-    problem, begin, controls, factors = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
+    num_samples = whole("num_samples", num_samples, 0)
+    problem, begin, controls, (factors,) = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
+    spread = deviations(stddev, problem)
     with traceable("cost"):
-        return _improved(problem, begin, controls, *factors)
+        return _improved(problem, begin, controls, factors, jax.random.fold_in(key, 1), spread, num_samples)
 
 
 def posed(
@@ -320,19 +353,40 @@ def per_control(name: str, value: ArrayLike, system: System, dtype: Any) -> Cont
     return jnp.broadcast_to(numbers, (size,))
 
 
+def deviations(stddev: ArrayLike | None, problem: Problem) -> ControlVector:
+    """Return the standard deviation of random changes of each control."""
+    if stddev is None:
+        reach = problem.upper - problem.lower
+        return jnp.where(jnp.isfinite(reach), _USUAL * reach, _UNLIMITED).astype(problem.lower.dtype)
+    given = per_control("stddev", stddev, problem.system, problem.lower.dtype)
+    if (value := known(given)) is not None and not ((value >= 0) & (value < np.inf)).all():
+        raise ValueError(f"stddev must be at least 0 and finite, got {value}")
+    return given
+
+
 @compiled
-def _improved(problem: Problem, start: StateVector, controls: _Controls, factors: Float[Array, " iterations"]) -> Plan:
+def _improved(
+    problem: Problem,
+    start: StateVector,
+    controls: _Controls,
+    factors: Float[Array, " iterations"],
+    key: PRNGKeyArray,
+    stddev: ControlVector,
+    num_samples: int,
+) -> Plan:
     """Return the plan; its data are arguments, so that to plan again needs no new compilation."""
     # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
     present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
-    inputs = (present, following, jnp.arange(len(present)) == 0)
-    none = jnp.zeros((0, *controls.shape))
+    inputs = (present, following, jnp.arange(len(present)) == 0, jax.random.split(key, len(present)))
 
-    def iterate(search: Search, at: tuple[_Scalar, _Scalar, Bool[Array, ""]]) -> tuple[Search, Iterations]:
-        factor, following, is_first = at
+    def iterate(
+        search: Search, at: tuple[_Scalar, _Scalar, Bool[Array, ""], PRNGKeyArray]
+    ) -> tuple[Search, Iterations]:
+        factor, following, is_first, key = at
+        noise = random_changes(key, stddev, num_samples, len(controls))
         improved = lambda: problem.solved(problem.linearised(search, factor))  # noqa: E731
         search = jax.lax.cond(is_first, lambda: search, improved)
-        search, true, step = problem.chosen(search, following, is_first, none)
+        search, true, step = problem.chosen(search, following, is_first, noise)
         return search, Iterations(factor, search.course.cost, true, step, search.law.promised)
 
     found, rows = jax.lax.scan(iterate, problem.begin(start, controls), inputs)

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 import mjxgrad as mg
 from mjxgrad import identification
@@ -41,7 +42,7 @@ def _states(xml: str, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _assert_intervals_hold(xml: str, recordings: list[identification.Recording], may_stall: bool) -> None:
-    """Of 20 intervals that hold with 95 %, 17 or more do with a chance of 98 %; `pytest -s` shows the counts."""
+    """Of so many intervals of 95 % as many hold as do with a chance of 98 %, 17 of 20; `pytest -s` shows the counts."""
     scene, held, halves = mg.load_scene(xml, keep_everything=True), [], []
     parameters = {"friction": identification.friction(scene), "mass": identification.mass(scene, "box")}
     for recording in recordings:
@@ -54,7 +55,7 @@ def _assert_intervals_hold(xml: str, recordings: list[identification.Recording],
     print(
         f"\nfriction and mass hold {np.sum(held, axis=0)} of {len(held)}, median half widths {np.round(100 * share, 2)} %"
     )
-    assert (np.sum(held, axis=0) >= 17).all()
+    assert (np.sum(held, axis=0) >= binom.ppf(0.02, len(held), 0.95)).all()
 
 
 @pytest.mark.parametrize(("contact", "chatters"), [(_SOFT, False), ("", True)], ids=["soft contact", "default contact"])
@@ -96,11 +97,14 @@ def test_intervals_of_twenty_recordings_of_mujoco_cover_the_truth(contact, turn,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("contact", [_SOFT, ""], ids=["soft contact", "default contact"])
-def test_intervals_hold_where_a_height_of_a_millimetre_decides_all_that_follows(contact):
-    """A free box, places to 1 mm: on soft contact 0.3 mm of height change the sum of squares eightfold."""
+@pytest.mark.parametrize(("contact", "count"), [(_SOFT, 20), ("", 100)], ids=["soft contact", "default contact"])
+def test_intervals_hold_where_a_height_of_a_millimetre_decides_all_that_follows(contact, count):
+    """A free box, places to 1 mm: on soft contact 0.3 mm of height change the sum of squares eightfold.
+
+    A hundred by default contact, since the errors of friction and mass go together: two counts that tell little more than one.
+    """
     xml, recordings = _FREE.format(contact), []
-    for seed in range(20):
+    for seed in range(count):
         t = 0.002 * np.arange(500 + 250 * (seed % 2))
         controls = np.stack([14 * np.sin(9 * t + seed), 11 * np.sin(6.5 * t + 1)], axis=1)
         places = _states(xml, controls)[0][:, :3]

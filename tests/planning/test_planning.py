@@ -1,5 +1,7 @@
 """Plans on smoothed models: against dense least squares where they are exact, and where contact must be made."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -187,6 +189,16 @@ def test_derivatives_that_are_no_numbers_are_told():
     assert plan.cost == plan.start_cost
     assert not plan.converged
     assert plan.verdict().startswith("not improved: the derivatives of its steps multiply beyond all numbers; give")
+
+
+@pytest.mark.parametrize(("reached", "told"), [(9.5, "not converged: 5% of what linear models promised came true"),
+                                              (6.0, "not converged; take more iterations")])  # fmt: skip
+def test_a_plan_whose_models_promise_in_vain_is_told(reached, told):
+    """Two iterations after the first one promised 5 each, and 0.5 or 4 came true."""
+    costs, plan = jnp.array([10.0, 9.8, reached]), _swinging(1.0)
+    iterations = dataclasses.replace(plan.iterations, smoothed_cost=costs, promised=jnp.array([9.0, 5.0, 5.0]))
+    plan = dataclasses.replace(plan, iterations=iterations, converged=jnp.asarray(False))
+    assert plan.verdict().startswith(told)
 
 
 def test_a_plan_is_the_rollout_of_its_controls():

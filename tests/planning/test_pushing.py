@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, LeastSquares, SceneSystem
+from mjxgrad.planning import Analytic, Controller, Exact, GoalCost, LeastSquares, SceneSystem, optimise_trajectory
+from mjxgrad.planning.trajectory import deviations, posed, random_changes
 
 PUSHER = """<mujoco><option timestep=".005"/><worldbody><geom name="floor" type="plane" size="2 2 .1"/>
   <body pos="-.15 0 .09"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
@@ -116,6 +117,34 @@ def test_too_short_a_deadline_is_told(system):
         UserWarning, match="and decisions may miss the deadline of 0.0001 ms: take one of .*; no plan is short enough"
     ):
         Controller(system, GoalCost(system.origin, 1.0, 1.0, 1.0), jnp.zeros((2, 2)), deadline=1e-7)
+
+
+def test_random_changes_of_a_plan_touch_what_derivatives_do_not_see(system):
+    """The gap is 6 cm; a twentieth of the controls' range of 2 m reaches it in a few iterations."""
+    given, how = (
+        (Push(jnp.asarray(0.0)), system.origin, jnp.zeros((12, 2)), KEY),
+        {"smoother": Exact(), "schedule": jnp.ones(5)},
+    )
+    still = optimise_trajectory(system, *given, **how)
+    assert still.cost == still.start_cost
+    assert "num_samples=32" in still.verdict()
+    found = optimise_trajectory(system, *given, **how, num_samples=16)
+    assert found.states[-1, 2] > 0.05
+    assert found.cost < 0.5 * found.start_cost
+
+
+def test_random_changes_are_as_large_as_their_limits_say(system):
+    """A twentieth of the range, or what is given: half of the samples of a normal number are within 0.6745 of it."""
+    problem = posed(
+        system, Push(jnp.asarray(0.0)), None, jnp.zeros((12, 2)), KEY, Exact(), [[1.0]], None, jnp.array([1.0, 3])
+    )[0]
+    np.testing.assert_allclose(deviations(None, problem), [0.1, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(deviations(0.3, problem), [0.3, 0.3])
+    changes = np.asarray(random_changes(KEY, jnp.array([1.0, 2.0]), 500, 8))
+    assert changes.shape == (500, 8, 2)
+    np.testing.assert_array_equal(changes[:, 0], changes[:, 1])
+    sizes = np.geomspace(0.125, 1, 500)[:, None, None] * [1.0, 2.0]
+    assert np.mean(np.abs(changes) < 0.6745 * sizes) == pytest.approx(0.5, abs=0.03)  # 4000 numbers: 4 standard errors
 
 
 @pytest.mark.filterwarnings("ignore:no control moves")
