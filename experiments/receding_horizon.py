@@ -63,7 +63,7 @@ def push(*, starts: int = 10, deadline: float | None = 0.04) -> None:
     system = planning.SceneSystem(scene=mg.load_scene(model, engine="mujoco"), num_substeps=_HELD)  # pyright: ignore
     cost = Push(goal=jnp.asarray(goal), home=jnp.asarray(home), tip=model.site("tcp").id)
     controller = planning.Controller(
-        system, cost, np.tile(home, (_NODES, 1)), num_samples=8, stddev=0.1, deadline=deadline
+        system, cost, np.tile(home, (_NODES, 1)), num_samples=12, stddev=0.1, deadline=deadline
     )
     print(controller)
     for _ in range(starts):

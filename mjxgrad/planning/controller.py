@@ -73,7 +73,8 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            num_samples: plans with random changes that are tried beside the step lengths; see `optimise_trajectory`.
+            num_samples: plans with random changes that are tried beside the step lengths, and in each decision that an
+                iteration takes; see `optimise_trajectory`.
             stddev: standard deviation of these changes.
             deadline: the time of a decision (s); one part of an iteration is taken at least. Where it is shorter than an
                 iteration more is compiled, to foretell from plans of two lengths what fits.
@@ -180,7 +181,7 @@ class Controller(Printed):
     def _iterate(self, factors: np.ndarray, limit: float) -> None:
         """Take iterations from where the last decision stopped, one part at least, up to a limit of the clock."""
         is_late = lambda: time.perf_counter() + self._expected(self._turn[0]) > limit  # noqa: E731
-        has_begun = False
+        has_begun = self._sample(factors[0], limit)
         for both in itertools.pairwise([*factors, factors[-1]]):
             while True:
                 if has_begun and is_late():
@@ -191,6 +192,19 @@ class Controller(Printed):
                 self._turn = self._iteration.after(turn)
                 if self._turn == self._iteration.first:
                     break
+
+    def _sample(self, factor: Any, limit: float) -> bool:
+        """Try random changes also where an iteration is under way, whose law is not known yet; return whether that was done."""
+        if not self.num_samples or self._turn in (self._iteration.first, LAST):
+            return False
+        has_time = sum(map(self._expected, (PARTS[-1], self._turn[0]))) <= limit - time.perf_counter()
+        if not has_time and len(self.seconds) % 2:  # every other time, so that the iteration comes to an end
+            return False
+        before = self._search
+        self._advance(LAST, (factor, factor))
+        # That the old law does not help says nothing of the next one.
+        self._search = dataclasses.replace(self._search, regularisation=before.regularisation)
+        return True
 
     def _begin(self, start: np.ndarray, is_first: bool) -> None:
         """Shift all by a step, to the present state; the first time compute the course of the given controls."""

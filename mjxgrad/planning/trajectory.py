@@ -25,6 +25,7 @@ _Matrix = Float[Array, "m m"]
 _Controls = Float[Array, "horizon m"]
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
 _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
+_FREE = 1.0  # regularisation up to which a step may go about as far as its model says
 # A plan has converged once its model predicts to lower the cost by no more than this share of it.
 _TOLERANCE = 1e-4
 # An influence of controls on a coordinate counts as zero below this share of the largest influence: roundings of differences.
@@ -99,7 +100,9 @@ class Plan(eqx.Module, Printed):
             return "converged"
         if (share := self._kept()) < _KEPT:
             came = f"{100 * max(share, 0.0):.2g}% of what linear models promised came true"
-            return f"not converged: {came}, as where contacts begin and end; take num_samples=32, or more smoothing"
+            return (
+                f"not converged: {came}, as where contacts begin and end; take random changes, num_samples=32 or more"
+            )
         return "not converged; take more iterations"
 
     def _kept(self) -> float:
@@ -381,16 +384,18 @@ def _improved(
 
     def iterate(
         search: Search, at: tuple[_Scalar, _Scalar, Bool[Array, ""], PRNGKeyArray]
-    ) -> tuple[Search, Iterations]:
+    ) -> tuple[Search, tuple[Iterations, _Scalar]]:
         factor, following, is_first, key = at
         noise = random_changes(key, stddev, num_samples, len(controls))
         improved = lambda: problem.solved(problem.linearised(search, factor))  # noqa: E731
-        search = jax.lax.cond(is_first, lambda: search, improved)
+        search, held = jax.lax.cond(is_first, lambda: search, improved), search.regularisation
         search, true, step = problem.chosen(search, following, is_first, noise)
-        return search, Iterations(factor, search.course.cost, true, step, search.law.promised)
+        return search, (Iterations(factor, search.course.cost, true, step, search.law.promised), held)
 
-    found, rows = jax.lax.scan(iterate, problem.begin(start, controls), inputs)
-    start_cost, rows = rows.cost[0], jax.tree.map(lambda x: x[1:], rows)
+    found, (rows, held) = jax.lax.scan(iterate, problem.begin(start, controls), inputs)
+    start_cost, (rows, held) = rows.cost[0], jax.tree.map(lambda x: x[1:], (rows, held))
+    # What is held to the controls as they are promises nothing, either.
+    promised = rows.promised[jnp.max(jnp.where(held <= _FREE, jnp.arange(len(held)), 0))]
     return Plan(
         controls=found.best.controls,
         states=found.best.states,
@@ -398,7 +403,7 @@ def _improved(
         cost=found.best.cost,
         iterations=rows,
         unmoved=found.unmoved,
-        converged=(rows.promised[-1] <= _TOLERANCE * jnp.abs(found.course.cost)) & ~found.unmoved.any(),
+        converged=(promised <= _TOLERANCE * jnp.abs(found.course.cost)) & ~found.unmoved.any(),
         diverged=~jnp.all(jnp.isfinite(rows.smoothed_cost)),
     )
 

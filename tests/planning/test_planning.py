@@ -201,6 +201,20 @@ def test_a_plan_whose_models_promise_in_vain_is_told(reached, told):
     assert plan.verdict().startswith(told)
 
 
+def test_a_plan_whose_derivatives_are_wrong_has_not_converged():
+    """Regularisation grows until the model promises nothing."""
+
+    def planned(factor):
+        step = lambda x, u: x + factor * u + jax.lax.stop_gradient((1 - factor) * u)  # noqa: E731
+        given = GoalCost(jnp.ones(1), 1.0, 1.0, 0.01), jnp.zeros(1), jnp.zeros((4, 1)), jax.random.key(0)
+        return optimise_trajectory(FunctionSystem(step, 1, 1), *given, smoother=Exact(), schedule=np.ones(30))
+
+    wrong = planned(-1.0)
+    assert wrong.iterations.promised[-1] < 1e-4 * wrong.cost
+    assert not wrong.converged
+    assert planned(1.0).converged
+
+
 def test_a_plan_is_the_rollout_of_its_controls():
     plan = pushing(Softly(jnp.array(0.3)))
     state = plan.states[0]
