@@ -68,7 +68,8 @@ class Plan(eqx.Module, Printed):
         iterations: records of the iterations.
         unmoved: coordinates of a change of the state that have a cost but that no control moves, by the last model. Their
             derivatives are zero because nothing is touched, so no iteration can improve them.
-        converged: whether the last model predicts almost no further decrease; never if a coordinate is unmoved.
+        converged: whether the last model that was free to move predicts almost no further decrease; never if a coordinate is
+            unmoved.
         diverged: whether the smoothed system left finite numbers, so that iterations were lost.
     """
 
@@ -106,9 +107,10 @@ class Plan(eqx.Module, Printed):
         return "not converged; take more iterations"
 
     def _kept(self) -> float:
-        """Return which share of the promised decreases came true."""
+        """Return which share of the promised decreases came true, of the smoothed cost or of the cost itself."""
         costs, promised = np.asarray(self.iterations.smoothed_cost), np.asarray(self.iterations.promised)
-        return float((costs[0] - costs[-1]) / max(promised[1:].sum(), np.finfo(float).tiny)) if len(costs) > 1 else 1.0
+        came = max(costs[0] - costs[-1], float(self.start_cost - self.cost))
+        return float(came / max(promised.sum(), np.finfo(float).tiny))
 
     def __str__(self) -> str:
         if is_traced(self.cost) or self.cost.ndim:
