@@ -252,7 +252,7 @@ class Worker:
         if one.is_explicit and self._is_steep(matrix):
             columns = np.flatnonzero(~(self._steepness(matrix) <= _NEARLY * _STEEP / self.model.opt.timestep))
             others = matrix.copy()
-            others[:, columns] = self._smooth(one, np.eye(nv, len(matrix))[columns], self._width(one), at_once=True).T
+            others[:, columns] = self._smooth(one, np.eye(nv, len(matrix))[columns], self._width(one)).T
             if self._steepness(others).max() < 0.5 * self._steepness(matrix).max():
                 matrix[:] = others
 
@@ -356,27 +356,25 @@ class Worker:
         """Return the width of differences of whole steps."""
         return WIDTH if one.near is None or not len(one.near.rough) or self.surfaces.has_stages else _RUBBING
 
-    def _smooth(
-        self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float, *, at_once: bool = False
-    ) -> np.ndarray:
+    def _smooth(self, one: _Row, directions: Float[np.ndarray, "columns changes"], width: float) -> np.ndarray:
         """Return differences along directions, over one side where the other has a jump, and narrower or wider where both have.
 
         A surface that is near has one jump. The points at which a bottle stands on a table jump with every turn: then all are
-        averaged over. All widths `at_once` take less time where several are needed.
+        averaged over.
         """
         # A stage of Runge-Kutta may meet a surface that the start is far from.
         is_own = one.clear is one.before and one.by is self.inverse
         middle = one.after if is_own else self._step(one.by, one.clear)
         wider = (_WIDER, _WIDER**2) if width < _RUBBING else ()
-        factors, steepest = (1.0, _NARROWER, _NARROWER**2, *wider), 1 / self.model.opt.timestep
+        others, steepest = np.array((_NARROWER, _NARROWER**2, *wider)), 1 / self.model.opt.timestep
         found, sizes = np.zeros_like(directions), np.full(len(directions), np.inf)
         left, had_jump = np.arange(len(sizes)), np.zeros(len(sizes), bool)
-        every = self._sides(one, middle, directions, width * np.array(factors)) if at_once else None
-        for number, factor in enumerate(factors):
-            if every is not None:
-                sides = every[number, left]
-            else:
-                (sides,) = self._sides(one, middle, directions[left], width * np.array([factor]))
+        every = self._sides(one, middle, directions, np.array([width]))
+        for number, factor in enumerate((1.0, *others)):
+            if number == 1:  # what needs another width often needs the last
+                every = np.zeros((1 + len(others), *every.shape[1:]))
+                every[1:, left] = self._sides(one, middle, directions[left], width * others)
+            sides = every[number, left]
             both, size = np.linalg.norm(sides, axis=2), np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1)
             jumps = (size > APART * both.max(axis=1)) & (both.max(axis=1) > steepest)
             least = np.take_along_axis(sides, both.argmin(axis=1)[:, None, None], axis=1)[:, 0]
