@@ -73,8 +73,8 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            num_samples: plans with random changes that are tried beside the step lengths, and in each decision that an
-                iteration takes; see `optimise_trajectory`.
+            num_samples: plans with random changes that are tried beside the step lengths, see `optimise_trajectory`. Where an
+                iteration is spread over decisions, they are tried in each that has the time, else in every other one.
             stddev: standard deviation of these changes.
             deadline: the time of a decision (s); one part of an iteration is taken at least. Where it is shorter than an
                 iteration more is compiled, to foretell from plans of two lengths what fits.

@@ -147,12 +147,27 @@ def test_random_changes_are_as_large_as_their_limits_say(system):
     assert np.mean(np.abs(changes) < 0.6745 * sizes) == pytest.approx(0.5, abs=0.03)  # 4000 numbers: 4 standard errors
 
 
+@pytest.fixture
+def sampling(system):
+    return Controller(system, Push(jnp.asarray(0.0)), jnp.zeros((12, 2)), num_samples=16, stddev=0.3)
+
+
 @pytest.mark.filterwarnings("ignore:no control moves")
-def test_samples_touch_what_derivatives_do_not_see(system):
-    found = Controller(system, Push(jnp.asarray(0.0)), jnp.zeros((12, 2)), num_samples=16, stddev=0.3)
+def test_samples_touch_what_derivatives_do_not_see(sampling, system):
     for _ in range(3):
-        found(np.asarray(system.origin))
-    assert found.plan.states[-1, 2] > 0.01
+        sampling(np.asarray(system.origin))
+    assert sampling.plan.states[-1, 2] > 0.01
+
+
+@pytest.mark.filterwarnings("ignore:no control moves")
+def test_random_plans_are_tried_while_an_iteration_is_under_way(sampling, system):
+    """One part a decision: linear models, random plans, the backward pass, rollouts. Rollouts alone give a plan a cost."""
+    sampling(np.asarray(system.origin))
+    sampling.deadline, has_cost = 1e-9, []
+    for _ in range(4):
+        sampling(np.asarray(system.origin))
+        has_cost.append(bool(np.isfinite(sampling.plan.cost)))
+    assert has_cost == [False, True, False, True]
 
 
 def test_widened_contacts_of_c_mujoco_act_from_a_distance(system):
