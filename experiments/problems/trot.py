@@ -138,7 +138,7 @@ def apg(**changes: Any) -> learning.Settings:
     """Return the settings of analytic policy gradients in brax, with which MuJoCo's notebook learns to trot.
 
     There is no value function, and windows follow one another. Two things differ from brax. The noise is not learned but
-    falls linearly from 0.07 to 0.01. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
+    falls linearly from 0.07 to 0.01, and being so small does not limit a step. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
     which allows larger rates.
 
     References:
@@ -147,5 +147,5 @@ def apg(**changes: Any) -> learning.Settings:
     """
     rates = {"stddev": (0.07, 0.01), "actor_rate": 1e-4, "actor_decay": 0.997}
     network = {"actor_layers": (256, 128), "actor_scale": 0.01}
-    plain = {"discount": 1.0, "trace": 1.0, "alpha": 1.0, "has_critic": False}
+    plain = {"discount": 1.0, "trace": 1.0, "alpha": 1.0, "has_critic": False, "largest_change": np.inf}
     return learning.Settings(**rates | network | plain | changes)

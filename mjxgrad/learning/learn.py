@@ -82,6 +82,8 @@ def learn(
     - `not_finite`, share of first-order gradients that were not finite; `shortened`, share of those that were too large, see
       `Settings.largest_sample`; `diverged`, number of steps without a meaningful next state;
       `skipped`, 1 if the mixture was not finite and the policy was not changed;
+    - `change`, relative entropy in nats of the policy's noisy actions by which an update would have changed them, in the mean;
+      see `Settings.largest_change`;
     - `critic_loss`, loss of the value function;
     - `seconds`, wall-clock time of an update of all policies, without compilation.
 

@@ -179,7 +179,7 @@ class ActorCritic(Method):
         first, last = settings.stddev
         stddev = first + (last - first) * learner.num_updates / self.num_updates
         window, environments, gradients = self._windows(learner, noise_key, stddev)
-        improved, found = self._improve(learner, window, gradients)
+        improved, found = self._improve(learner, window, gradients, stddev)
         fitted, critic_loss = improved, jnp.zeros(())
         if settings.has_critic:
             fitted, critic_loss = self._fit_critic(improved, window, critic_key)
@@ -230,7 +230,9 @@ class ActorCritic(Method):
         shared = (arrays, learner.policy.actor, learner.target, learner.normaliser, stddev)
         return over_devices(one, num_shared=1)(shared, learner.environments, learner.model_keys, noise)
 
-    def _improve(self, learner: Learner, window: Window, gradients: Gradients) -> tuple[Learner, Metrics]:
+    def _improve(
+        self, learner: Learner, window: Window, gradients: Gradients, stddev: Float[Array, ""]
+    ) -> tuple[Learner, Metrics]:
         """Move the policy along the mixture, if that is finite."""
         policy = learner.policy
         shortened, is_shortened = gradients.shortened(self.settings.largest_sample)
@@ -239,7 +241,7 @@ class ActorCritic(Method):
             obs = window.seen[..., : len(policy.normaliser.mean)]
             return jax.vmap(jax.vmap(lambda obs: actor(policy.normaliser(obs))))(obs)
 
-        _, pull_back = jax.vjp(acted, policy.actor)
+        before, pull_back = jax.vjp(acted, policy.actor)
         count = self.settings.num_environments
         is_first = (jnp.arange(count) < count // 2)[:, None, None]
 
@@ -258,7 +260,12 @@ class ActorCritic(Method):
         is_finite = jnp.isfinite(norm)
         optimiser, _ = optimisers(self.settings, self.num_updates)
         old = (policy.actor, learner.actor_moments)
-        new = _stepped(optimiser, gradient, learner.actor_moments, policy.actor)
+        steps, moments = optimiser.update(gradient, learner.actor_moments)
+        after = acted(eqx.apply_updates(policy.actor, steps))
+        # Nats of relative entropy, which grow with the square of a step.
+        change = ((after - before) ** 2).sum(axis=-1).mean() / (2 * stddev**2)
+        share = jnp.minimum(1.0, jnp.sqrt(self.settings.largest_change / change))
+        new = (eqx.apply_updates(policy.actor, jax.tree.map(lambda step: share * step, steps)), moments)
         actor, moments = jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), new, old)
         found = {
             "alpha": a / jnp.where(a + b > 0, a + b, 1.0),
@@ -270,6 +277,7 @@ class ActorCritic(Method):
             "not_finite": (~gradients.is_finite).mean(),
             "shortened": is_shortened.mean(),
             "skipped": (~is_finite).astype(norm.dtype),
+            "change": change,
         }
         moved = {"policy": Policy(actor, policy.normaliser), "actor_moments": moments, "products": products}
         return dataclasses.replace(learner, **moved), found

@@ -109,6 +109,8 @@ class Settings:
         largest_sample: largest norm of the first-order gradient of one environment's step; longer ones are shortened. The
             unit is the root mean square of the zeroth-order gradient over environments: 0.1 limits the first-order variance
             to a hundredth of the zeroth-order one. Infinity shortens none.
+        largest_change: largest change of the noisy policy in an update, the relative entropy of its actions in nats, in the
+            mean over what was observed; longer steps are shortened. Infinity shortens none.
         has_critic: whether a value function estimates the rewards after a window; otherwise they are left out, and `trace`
             must be 1.
         bundle: branches over which derivatives are averaged where contact pushes hard; None takes them as they are.
@@ -129,6 +131,7 @@ class Settings:
     critic_iterations: int = 16
     critic_batches: int = 4
     largest_sample: float = 0.1
+    largest_change: float = 0.05
     has_critic: bool = True
     bundle: Bundle | None = None
 
@@ -140,8 +143,9 @@ class Settings:
             whole(name, getattr(self, name))
         for name in given("actor_scale", "actor_rate", "critic_rate", "actor_decay"):
             positive(name, getattr(self, name))
-        if self.largest_sample != np.inf:  # which shortens none
-            positive("largest_sample", self.largest_sample)
+        for name in ("largest_sample", "largest_change"):
+            if getattr(self, name) != np.inf:  # which shortens none
+                positive(name, getattr(self, name))
         instance("bundle", self.bundle, Bundle | None, "of mg.learning.Bundle")
         instance("has_critic", self.has_critic, bool, "True or False")
         for name in ("actor_layers", "critic_layers"):  # a list has no hash

@@ -253,7 +253,7 @@ class _Meter:
     def __init__(self, run: str, step: str, num_steps: int, tells: bool, has_log: bool):
         self.run, self.step, self.num_steps, self.tells, self.has_log = run, step, num_steps, tells, has_log
         self.seconds = self.began = self.last = 0.0  # of a step; when the first began; when something was told
-        self.num_before, self.is_shown = 0, False  # steps of a checkpoint
+        self.num_before, self.told = 0, 0.0  # steps of a checkpoint; the seconds that a step was said to take
 
     def compiled(self, compile: Callable[[], Any]) -> Any:
         """Compile, and tell of it where it takes long."""
@@ -282,13 +282,14 @@ class _Meter:
         new = rows, np.full(count, self.seconds)
         found, seconds = jax.tree.map(lambda old, new: np.concatenate([old, np.asarray(new)[:count]]), done[1:3], new)
         left = (self.num_steps - int(reached)) * self.seconds
-        if self.is_shown and not self.has_log and now - self.last > (0.9 if sys.stderr.isatty() else 30):
+        if self.told and not self.has_log and now - self.last > (0.9 if sys.stderr.isatty() else 30):
             self.tell(f"{self.run}: {self.step} {reached} of {self.num_steps}, about {duration(left)} left")
-        elif not self.is_shown and left > _LONG and now - self.began > 2 * _PULSE:
+        # A first step can take ten times as long as the others, on a GPU or where programs compile beside it.
+        elif self.told > 2 * self.seconds or (not self.told and left > _LONG and now - self.began > 2 * _PULSE):
             once = f"{duration(self.seconds)} {'an' if self.step[0] in 'aeiou' else 'a'} {self.step}"
             every = f"the {self.num_steps - int(reached)} left of " * (self.num_before > 0) + str(self.num_steps)
             self.tell(f"{self.run}: {once}, about {duration(left)} for {every}; Ctrl-C keeps what was found\n")
-            self.is_shown = True
+            self.told = self.seconds
         return done._replace(carry=carry, found=found, seconds=seconds)
 
     def tell(self, text: str) -> None:

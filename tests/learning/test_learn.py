@@ -177,7 +177,7 @@ def test_an_evaluation_ends_with_the_episode(cartpole, key):
 def test_without_a_value_function_the_mean_reward_is_climbed(cartpole, key):
     """The gradient of one update against that of a plain sum over windows, and of both halves; with hardly any noise."""
     settings = learning.Settings(
-        num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf,
+        num_environments=4, window=3, actor_layers=(6,), stddev=(1e-9, 1e-9), largest_sample=np.inf, largest_change=np.inf,
         discount=1.0, trace=1.0, alpha=1.0, has_critic=False,
     )  # fmt: skip
     run = learning.learn(cartpole, key, num_updates=1, settings=settings)
@@ -209,6 +209,31 @@ def test_gradients_are_clipped_by_their_norm():
     optimiser, _ = learning.learner.optimisers(learning.Settings(), 5)
     _, moments = optimiser.update(jnp.array([3.0, 4.0]), optimiser.init(jnp.zeros(2)))
     assert_allclose(optax.tree.get(moments, "mu"), [0.18, 0.24], rtol=1e-6)
+
+
+def test_a_step_changes_the_noisy_policy_by_no_more_than_its_limit(cartpole, key):
+    """By the relative entropy of normal distributions, at the starts, which are all that windows of one action observe.
+
+    Steps are shortened and not turned. That entropy grows with the square of a step is off by the network's curvature.
+    """
+    settings = dataclasses.replace(SMALL, window=1, critic_batches=2, stddev=(0.4, 0.4), actor_rate=0.1)
+    before = eqx.filter_jit(ActorCritic(cartpole, settings.counted(1 / 60), 1).init)(key)
+
+    def learnt(most):
+        run = learning.learn(cartpole, key, num_updates=1, settings=dataclasses.replace(settings, largest_change=most))
+        obs = before.policy.normaliser(before.environments.obs)
+        old, new = (jax.vmap(actor)(obs) for actor in (before.policy.actor, run.policy.actor))
+        steps = jax.tree.map(lambda x, y: np.asarray(y - x), before.policy.actor, run.policy.actor)
+        entropy = float(((new - old) ** 2).sum(axis=1).mean() / (2 * 0.4**2))
+        return np.concatenate([x.ravel() for x in jax.tree.leaves(steps)]), entropy, float(run.history["change"][0])
+
+    free, wanted, told = learnt(np.inf)
+    assert_allclose(told, wanted, rtol=1e-6)
+    short, changed, told = learnt(1e-4)
+    assert_allclose(told, wanted, rtol=1e-6)
+    assert wanted > 1e-2
+    assert_allclose(short, (1e-4 / wanted) ** 0.5 * free, rtol=1e-6, atol=1e-9)
+    assert_allclose(changed, 1e-4, rtol=0.3)
 
 
 @pytest.mark.parametrize(("decay", "rates"), [(None, [0.5, 0.4, 0.3]), (0.9, [0.5, 0.45, 0.405])])

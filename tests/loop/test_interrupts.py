@@ -61,6 +61,29 @@ def test_ctrl_c_before_any_step_is_one():
         run(Slow(), jnp.zeros(()), num_steps=1000, segment=50)
 
 
+class SlowAtFirst(Method):
+    """A count, whose first step takes 1.2 s and the others 20 ms."""
+
+    def init(self, start):
+        return start
+
+    def step(self, carry, index):
+        def wait(x):
+            time.sleep(1.2 if x == 1 else 0.02)
+            return np.asarray(x)
+
+        after = jax.pure_callback(wait, jax.ShapeDtypeStruct((), carry.dtype), carry + 1)
+        return after, {"count": after}
+
+
+def test_a_price_by_a_slow_first_step_is_told_anew(capfd):
+    """After the first step it is 1.2 s a step, then 20 ms, or more on a busy machine."""
+    run(SlowAtFirst(), jnp.zeros(()), num_steps=60, segment=60, log=lambda *_: None)
+    told = [float(line.split()[1]) for line in capfd.readouterr().err.splitlines() if "for 60" in line]
+    assert told[0] >= 1.2
+    assert told[-1] < told[0] / 2
+
+
 def test_a_short_run_says_nothing(capfd):
     run(Slow(), jnp.zeros(()), num_steps=3, segment=2)
     assert capfd.readouterr().err == ""
