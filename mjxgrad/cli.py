@@ -300,7 +300,7 @@ def identify(
 
 @app.command
 def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) -> None:
-    """Write a program that optimises a motion of a scene and films it, with the settings that a quick check recommends.
+    """Write a program that optimises a motion of a scene and films it, with the settings that a check recommends.
 
     Args:
         scene: an MJCF file, with actuators.
@@ -312,15 +312,17 @@ def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) ->
     if output.exists() and not force:
         raise CommandError(f"{output} exists already; name another --output, or replace it with --force")
     _writable(output, beside=(scene,))
-    verdict = _library().check(_existing(scene), derivatives=False)
-    if not verdict.scene.model.nu:
+    _existing(scene)
+    mg, log = _library(), _timed()
+    if not mg.load_scene(scene, engine="mujoco").mj_model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
+    log("checks the scene for up to 20 s; Ctrl-C ends that sooner")
+    verdict = mg.check(scene, log=log)
     program = importlib.import_module("mjxgrad.checking.check").program
-    write(output, program(verdict, str(Path(scene)), str(output.with_suffix(".mp4"))))
-    _print(
-        f"{verdict.headline}\nwrote {output}: write your cost into it, then {shlex.join(['python', str(output)])}",
-        sys.stdout,
-    )
+    text, seconds = program(verdict, str(Path(scene)), str(output.with_suffix(".mp4")))
+    write(output, text)
+    told = f"write your cost into it, then {shlex.join(['python', str(output)])}, which takes about {duration(10 + seconds)}"
+    _print(f"{verdict.headline}\nwrote {output}: {told}", sys.stdout)
     if not all(map(importlib.util.find_spec, ("mediapy", "imageio_ffmpeg"))):
         _say("its video needs packages that are missing: pip install 'mjxgrad[render]'")
 

@@ -1,6 +1,7 @@
 """The command line: what it prints where, its exit codes, and what it writes."""
 
 import contextlib
+import functools
 import io
 import os
 import signal
@@ -36,6 +37,11 @@ def scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("scene.xml").write_text(SCENE.format(gear=1))
     return "scene.xml"
+
+
+@pytest.fixture
+def checks_quickly(monkeypatch):
+    monkeypatch.setattr(mg, "check", functools.partial(mg.check, derivatives=False))
 
 
 def test_check_prints_its_verdict_and_says_no_fault_by_its_exit_code(scene, capsys):
@@ -292,9 +298,12 @@ def test_an_interruption_of_an_import_reaches_the_program_even_if_it_was_swallow
     assert done.stdout.splitlines()[0] == "told", done.stderr
 
 
-def test_new_says_before_the_work_what_its_video_lacks(scene, capsys, monkeypatch):
+@pytest.mark.usefixtures("checks_quickly")
+def test_new_says_what_its_program_takes_and_what_its_video_lacks(scene, capsys, monkeypatch):
     assert cli.main(["new", scene]) == 0
-    assert "video" not in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "which takes about" in said.out
+    assert "video" not in said.err
     monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
     assert cli.main(["new", scene, "--force"]) == 0
     assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
@@ -373,6 +382,7 @@ def test_what_could_not_be_written_is_refused_before_the_work(scene, capsys, mon
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("checks_quickly")
 def test_a_program_is_short_starts_at_the_key_frame_and_holds_no_code_of_a_file_name(scene, monkeypatch):
     name = 'q""" + stop + """.xml'
     keyed = SCENE.format(gear=1).replace(

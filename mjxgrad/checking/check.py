@@ -51,6 +51,8 @@ _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
 _SIZE = (4.6, 2.9)  # of a figure, in inches
 _UNITS = {"where": "m, rad", "how": "m/s, rad/s"}  # by an outcome's first word; others have the user's units
+_NUM_STEPS, _FEWEST, _MOST_SAMPLES = 30, 4, 16  # of a program's optimisation
+_PATIENCE = 90.0  # s that it may take with more than the fewest samples
 _MOVED = 0.6  # approximate share of the budget for simulating motions
 
 
@@ -69,6 +71,8 @@ class Verdict(Paged):
         stability: stability of each contact at the time step.
         motions: motions by C MuJoCo.
         measured: measurements of derivatives; None if derivatives were not asked for.
+        seconds: duration in s of a time step of a "motion", and of its "discrete" gradient and its "slope", by C MuJoCo on
+            all cores; none without actuators.
     """
 
     name: str
@@ -81,6 +85,7 @@ class Verdict(Paged):
     stability: StabilityReport
     motions: Motions
     measured: Measured | None
+    seconds: dict[str, float]
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -221,7 +226,8 @@ def check(
         found += findings.measured_findings(measured) if measured else ()
         found += findings.left_out_findings(measured, None if was_interrupted else budget)
     seen = scene, motions, stability, measured, prices
-    return finished(lambda: _verdict(*seen, [*found], names, path, None if was_interrupted else say))
+    of = path, cost if isinstance(cost, str) else None
+    return finished(lambda: _verdict(*seen, [*found], names, of, None if was_interrupted else say))
 
 
 def _verdict(
@@ -232,10 +238,10 @@ def _verdict(
     prices: dict[str, float],
     found: list[Finding],
     names: tuple[str, ...],
-    path: str,
+    of: tuple[str, str | None],
     say: Callable[[str], None] | None,
 ) -> Verdict:
-    """Return what all findings amount to; without `say` engines are not compared."""
+    """Return what all findings amount to, of a file and the name of a cost; without `say` engines are not compared."""
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
@@ -247,21 +253,22 @@ def _verdict(
         advice = dataclasses.replace(advice, engine=min(seconds, key=lambda engine: seconds[engine][1]))
         found.append(findings.engine_prices_finding(seconds))
     told = slopes(measured.lines) if measured else ()
+    totals = {kind: advice.horizon * seconds for kind, seconds in prices.items()}
     if prices:
-        prices = {kind: advice.horizon * seconds for kind, seconds in prices.items()}
-        found.append(findings.price_finding(prices, told, advice.horizon))
+        found.append(findings.price_finding(totals, told, advice.horizon))
     order = {"slope": 0, "price": 1, "left_out": 3, "not_measured": 3}
     return Verdict(
         name=scene.name,
-        headline=findings.headline(found, advice, motions, told, prices),
+        headline=findings.headline(found, advice, motions, told, totals),
         findings=tuple(sorted(found, key=lambda one: (not one.is_fault, order.get(one.kind, 2)))),
         recommendation=advice,
-        code=_code(scene, advice, path),
+        code=_code(scene, advice, *of),
         outcomes=names,
         scene=scene,
         stability=stability,
         motions=motions,
         measured=measured,
+        seconds=prices,
     )
 
 
@@ -312,23 +319,28 @@ def _noise_text(noise: Noise) -> str:
     return f"Noise {noise.stddev:g}, {where}: {told}"
 
 
-def _setup(scene: Scene, advice: Recommendation, path: str, more: str = "") -> str:
+def _setup(scene: Scene, advice: Recommendation, path: str, more: str = "", cost: str | None = None) -> str:
     """Return the beginning of a program with the recommended settings, up to its start and its task."""
+    yours, drive = "  # your file" * (not Path(path).exists()), " + 1e-3 * (trajectory.ctrl**2).mean()"
+    costing = f"""\
+# Your cost, from a trajectory to a number; here how far it comes (m or rad).
+cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}
+"""
+    if cost is not None:
+        more, costing = f"from mjxgrad.checking import named_cost\n{more}", f"cost = named_cost(scene, {cost!r})\n"
     # On GPUs what was fastest; elsewhere what compiles nothing.
     engine = QUICK if device.is_cpu() else advice.engine
     given = {"timestep": advice.timestep, "max_contacts": advice.max_contacts, "engine": engine}
     settings = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if advice.stiffness is not None:
         settings += f", softness=mg.Softness(stiffness={format_number(advice.stiffness)}, damping_ratio=1.0)"
-    yours, drive = "  # your file" * (not Path(path).exists()), " + 1e-3 * (trajectory.ctrl**2).mean()"
     return f"""\
 import jax
 import jax.numpy as jnp
 import mjxgrad as mg
 {more}
 scene = mg.load_scene({path!r}{settings}){yours}
-# Your cost, from a trajectory to a number; here how far it comes (m or rad).
-cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}
+{costing}\
 start = mg.initial_state(scene{_keyframe(scene)})
 task = mg.SceneTask(scene, start, cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
 """
@@ -345,7 +357,7 @@ def _home(scene: Scene) -> str:
     return f"scene.mj_model.key({model.key(0).name or 0!r}).ctrl" if model.nkey else "jnp.zeros(scene.model.nu)"
 
 
-def _code(scene: Scene, advice: Recommendation, path: str) -> str:
+def _code(scene: Scene, advice: Recommendation, path: str, cost: str | None) -> str:
     """Return the recommendation as a program."""
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
     noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
@@ -354,18 +366,23 @@ def _code(scene: Scene, advice: Recommendation, path: str) -> str:
         run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{_keyframe(scene)})).cost"
         objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise}, dim={scene.model.nv})"
     return f"""\
-{_setup(scene, advice, path)}\
+{_setup(scene, advice, path, cost=cost)}\
 objective = {objective}
 params = {f"jnp.tile({_home(scene)}, task.horizon)" if scene.model.nu else "jnp.zeros(objective.dim)"}
 estimate = mg.estimators.{advice.estimator}(objective, params, jax.random.key(0), num_samples=32)
 """
 
 
-def program(verdict: Verdict, path: str, video: str) -> str:
-    """Return a program that optimises a motion of a scene with actuators by the recommended settings, and films it."""
+def program(verdict: Verdict, path: str, video: str) -> tuple[str, float]:
+    """Return a program that optimises a motion of a scene with actuators by the recommended settings, and films it.
+
+    With it go the seconds that its optimisation will take, of which long motions get fewer samples.
+    """
     advice = verdict.recommendation
     timestep = advice.timestep or verdict.motions.timestep
     horizon, held = min(300, max(50, round(0.5 / timestep))), max(1, round(0.05 / timestep))
+    each = _NUM_STEPS * horizon * verdict.seconds.get(advice.gradient, 0.0)
+    num_samples = int(np.clip(_PATIENCE / max(each, 1e-9), _FEWEST, _MOST_SAMPLES)) // 2 * 2
     more = "import optax\n\nmg.keep_compiled()  # on disk, so that the next run starts at once"
     parts = {
         "name": repr(Path(path).name)[1:-1].replace('"', "'"),  # within a docstring
@@ -375,9 +392,12 @@ def program(verdict: Verdict, path: str, video: str) -> str:
         "num_knots": -(-horizon // held),
         "stddev": advice.stddev,
         "estimator": advice.estimator,
+        "num_samples": num_samples,
+        "num_steps": _NUM_STEPS,
         "video": repr(video),
     }
-    return string.Template(Path(__file__).with_name("program.txt").read_text("utf-8")).substitute(parts)
+    template = string.Template(Path(__file__).with_name("program.txt").read_text("utf-8"))
+    return template.substitute(parts), each * num_samples
 
 
 def telling(measured: Measured, outcomes: Sequence[str]) -> Block:

@@ -27,6 +27,7 @@ _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the la
 _NUM_INDEXED = 3  # steps of a trajectory whose indices are tried
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
+_MOST_UNMEASURED = 4.0  # times the price of a discrete derivative, up to which a slope is taken unmeasured
 _DEGREES = 10.0  # least share of a control range and its joint's that tells of degrees, which are 57 times rad
 _OFF = 0.25  # expected error of a derivative from which it is a fault
 _ENOUGH = 32  # motions
@@ -320,12 +321,16 @@ def recommend(
     max_contacts: int | None,
     price: int | float = math.inf,
 ) -> Recommendation:
-    """Return the recommended settings from measurements and the price of a slope in that of a discrete derivative."""
+    """Return the recommended settings from measurements and the price of a slope in that of a discrete derivative.
+
+    Where nothing was measured, nothing speaks against the slope but its price.
+    """
     needed = [_largest_step(spring) for spring in _steps_too_long(stability)]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
-        return Recommendation("slope", "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
+        gradient = "slope" if price <= _MOST_UNMEASURED else "discrete"
+        return Recommendation(gradient, "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
     found = slopes(measured.lines)
     touches = bool(motions.touches or motions.touching)
     best = nearest(found, price) if touches else "discrete"

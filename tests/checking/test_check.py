@@ -1,5 +1,6 @@
 """Planted faults are named, and what is measured is what closed forms say."""
 
+import dataclasses
 import functools
 import importlib
 import re
@@ -15,7 +16,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.checking import findings
-from mjxgrad.checking.check import _warned, telling
+from mjxgrad.checking.check import _warned, program, telling
 from mjxgrad.checking.findings import headline, left_out_findings, measured_findings, price_finding, recommend
 from mjxgrad.checking.measure import Line, Measured, Slope, crossover, estimates, measure, nearest, slopes
 from mjxgrad.checking.motions import (
@@ -208,7 +209,7 @@ def measuring():
     def measured_by(mover, log=lambda _: None):
         return measure(scene, motions, mover, rng, from_start=False, seconds=1, log=log)
 
-    return measured_by, lambda measured: recommend(motions, stability, measured, None)
+    return measured_by, lambda measured, price=np.inf: recommend(motions, stability, measured, None, price)
 
 
 class OutOfTime(Mover):
@@ -526,6 +527,34 @@ def test_the_code_of_a_verdict_runs(bounce, tmp_path):
     code = bounce.code.replace("'scene.xml'", repr(str(tmp_path / "scene.xml")))
     exec(compile(code, "verdict", "exec"), names)
     assert np.isfinite(names["estimate"].value).all()
+
+
+def test_the_code_has_a_cost_by_its_name(tmp_path):
+    """Minus the height of the ball in the end, which began at 0.3 m and fell for five steps."""
+    path = tmp_path / "scene.xml"
+    path.write_text(ball())
+    names = {}
+    code = mg.check(path, "height:ball", derivatives=False).code
+    exec(compile(code.partition("objective =")[0], "verdict", "exec"), names)
+    ended = mg.rollout(names["scene"], names["start"], jnp.zeros((5, 1)))
+    np.testing.assert_allclose(names["cost"](ended), -0.3 - ended.qpos[-1, 0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("price", "gradient"), [(3.0, "slope"), (10.0, "discrete")])
+def test_a_slope_that_was_not_measured_is_taken_where_it_is_cheap(measuring, price, gradient):
+    _, advise = measuring
+    assert advise(None, price).gradient == gradient
+
+
+def test_a_program_of_slow_steps_has_fewer_samples_and_foretells_its_time(bounce):
+    """30 steps of 16 samples of 250 time steps are 120 000: at 0.1 ms 12 s; at 10 ms four samples take 300 s."""
+    advice = dataclasses.replace(bounce.recommendation, gradient="discrete", timestep=None)
+    assert bounce.motions.timestep == 0.002
+    for each, num_samples, wanted in [(1e-4, 16, 12.0), (1e-3, 12, 90.0), (1e-2, 4, 300.0)]:
+        verdict = dataclasses.replace(bounce, recommendation=advice, seconds={"discrete": each})
+        text, seconds = program(verdict, "scene.xml", "task.mp4")
+        assert f"num_samples={num_samples})" in text
+        np.testing.assert_allclose(seconds, wanted)
 
 
 SEVEN = ("hopper", "half_cheetah", "walker2d", "ant", "humanoid", "swimmer", "inverted_double_pendulum")
