@@ -2,6 +2,8 @@
 
 import html
 import os
+import sys
+import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,6 +66,18 @@ def duration(seconds: int | float) -> str:
         if seconds >= 1.5 * size or unit == "s":
             return f"{float(f'{seconds / size:.2g}'):g} {unit}"
     return ""
+
+
+def paced(name: str) -> Callable[[str], None]:
+    """Return a function that tells on stderr where a long call is: from its third second on, and then every ten."""
+    due = [time.monotonic() + 2.0]
+
+    def say(text: str) -> None:
+        if time.monotonic() > due[0]:
+            due[0] = time.monotonic() + 10.0
+            print(f"{name}: {text}; Ctrl-C keeps what was found", file=sys.stderr, flush=True)
+
+    return say
 
 
 def write(path: str | Path, content: str | bytes) -> None:

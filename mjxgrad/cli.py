@@ -237,7 +237,8 @@ def identify(
     for path in written:
         _writable(path, makes_folder=True, is_page=True, beside=(scene, *recordings))
     mg, log = _library(), _timed()
-    files, page = (importlib.import_module(f"mjxgrad.identification.{name}") for name in ("files", "page"))
+    parts = ("files", "page", "search")
+    files, page, search = (importlib.import_module(f"mjxgrad.identification.{name}") for name in parts)
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
     if len({os.path.realpath(path) for path in recordings}) < len(recordings):
@@ -253,7 +254,7 @@ def identify(
     if len(wanted) < len(parameter):
         raise CommandError(f"--parameter must name each parameter once, got {' '.join(parameter)}")
     motions = []
-    sizes, left_out, unit = dict(map(_number, noise)), [], "times the noise" if noise else "times the motion"
+    sizes, left_out = dict(map(_number, noise)), []
     if len(sizes) < len(noise):
         raise CommandError(f"--noise must name each column once, got {' '.join(noise)}")
     for path in recordings:
@@ -277,13 +278,7 @@ def identify(
     log(mg.identification.outlook(loaded, wanted, fitted, **given).summary())
 
     def say(step: int, metrics: dict[str, float]) -> None:
-        part = "" if metrics["share"] == 1 else f" over the first {100 * metrics['share']:.0f} %"
-        num, index, count = (int(metrics[name]) for name in ("motions", "start", "starts"))
-        doing = f", other start {index} of {count}" if index else f", best of {count} other starts" if count > 1 else ""
-        doing += f", mean of {num} motions" if num > 1 else ""
-        log(
-            f"step {step}: error {metrics['rms']:.3g} {unit}{part}{doing}, about {duration(max(metrics['seconds'], 1))} to go"
-        )
+        log(search.as_text(step, metrics, bool(noise)))
 
     result = mg.identify(loaded, wanted, fitted, held_out=judged, max_steps=max_steps, log=say, **given)
     _print(finished(lambda: "\n".join([result.headline, "", result.summary(), *left_out])), sys.stdout)
@@ -314,7 +309,8 @@ def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) ->
     _writable(output, beside=(scene,))
     _existing(scene)
     mg, log = _library(), _timed()
-    if not mg.load_scene(scene, engine="mujoco").mj_model.nu:
+    quick = importlib.import_module("mjxgrad.engines").QUICK
+    if not mg.load_scene(scene, engine=quick).mj_model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     log("checks the scene for up to 20 s; Ctrl-C ends that sooner")
     verdict = mg.check(scene, log=log)

@@ -22,7 +22,7 @@ import numpy as np
 
 from mjxgrad._arrays import function, instance, real, whole
 from mjxgrad._interrupts import finished, patiently
-from mjxgrad._text import Paged, format_number
+from mjxgrad._text import Paged, format_number, paced
 from mjxgrad.batched import device
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
@@ -144,6 +144,7 @@ def check(
     budget: int | float = 12.0,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
+    progress: bool = True,
 ) -> Verdict:
     """Check whether and how a scene can be differentiated.
 
@@ -161,6 +162,7 @@ def check(
             measurements that are left out.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts.
+        progress: whether a check of more than two seconds tells on stderr where it is, without a log.
 
     Returns:
         The verdict; `print` it.
@@ -171,11 +173,12 @@ def check(
     """
     instance("derivatives", derivatives, bool, "True or False")
     instance("mjx", mjx, bool, "True or False")
+    instance("progress", progress, bool, "True or False")
     if not real("budget", budget) > 0:
         raise ValueError(f"budget must be positive, got {budget}; derivatives=False measures nothing")
     function("log", log, "text")
     function("cost", None if isinstance(cost, str) else cost, "trajectory")
-    say = log or (lambda _: None)
+    say = log or (paced("check") if progress else lambda _: None)
     begun = time.perf_counter()
     rng = np.random.default_rng(whole("seed", seed, 0))
     with warnings.catch_warnings(record=True) as caught:

@@ -15,8 +15,8 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from mjxgrad._arrays import function, is_known, real, whole
-from mjxgrad._text import Paged, aligned, duration, format_number
+from mjxgrad._arrays import function, instance, is_known, real, whole
+from mjxgrad._text import Paged, aligned, duration, format_number, paced
 from mjxgrad.batched import device
 from mjxgrad.checking.check import Source, in_double, outcomes_of
 from mjxgrad.checking.costs import Cost, named_cost
@@ -334,6 +334,7 @@ def sweep(
     num_reference: int | None = None,
     seed: int = 0,
     log: Callable[[str], None] | None = None,
+    progress: bool = True,
     engine: EngineName | None = None,
     **task_settings: Any,
 ) -> Sweep:
@@ -349,6 +350,7 @@ def sweep(
         num_samples: rollouts per estimate; by default 256, fewer by C MuJoCo where these take more than two minutes, at least 64.
         num_reference: rollouts for the truth, without derivatives; by default sixteen times as many.
         seed: seed of all random numbers.
+        progress: whether a sweep of more than two seconds tells on stderr where it is, without a log.
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
         engine: who steps, see `Scene.with_engine`; by default a scene's own, and of a file on a CPU C MuJoCo, which compiles
             nothing.
@@ -370,7 +372,8 @@ def sweep(
     if num_samples is not None:
         whole("num_samples", num_samples, 2)
     function("log", log, "text")
-    say, began, last = log or (lambda _: None), [], [0]
+    instance("progress", progress, bool, "True or False")
+    say, began, last = log or (paced("sweep") if progress else lambda _: None), [], [0]
     is_own = isinstance(task_settings.get("contact"), Slope | Discrete | None)
     quick = QUICK if is_own and device.is_cpu() else None
     scene = source if isinstance(source, Scene) else load_scene(source, engine=engine or quick)

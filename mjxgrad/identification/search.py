@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._arrays import function, instance, whole
+from mjxgrad._text import duration, paced
 from mjxgrad.identification.ensemble import EXPECTED, MISFIT, Ensemble, algebra, fit
 from mjxgrad.identification.ensemble import size as ensemble_size
 from mjxgrad.identification.motions import AT_ONCE, Motions
@@ -83,6 +84,7 @@ def identify(
     contact: Contact | None = None,
     max_steps: int = 100,
     log: Log = None,
+    progress: bool = True,
 ) -> Identification:
     r"""Identify parameters of a scene from recorded motions, through contact.
 
@@ -105,6 +107,7 @@ def identify(
             after each derivative or ensemble; step 0 is the nominal motion. The share of the motions was simulated, and the
             seconds are left, about. An rms is of one motion, or of the mean of many over the covariance of noise and chatter.
             Where more than noise is left, 512 other starts are compared, and the descents from the best are numbered from 1.
+        progress: whether a search of more than two seconds tells on stderr how far it is, without a log.
 
     Returns:
         The values, their intervals, and undetermined parameters; `print(result.summary())`.
@@ -119,8 +122,12 @@ def identify(
     for part in held_out:
         instance("recordings", part, Recording, "of mg.identification.Recording")
     function("log", log, "step", "metrics")
-    search = _Search(given, whole("max_steps", max_steps), log)
+    instance("progress", progress, bool, "True or False")
     has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
+    if log is None and progress:
+        say = paced("identify")
+        log = lambda step, metrics: say(as_text(step, metrics, has_noise))  # noqa: E731
+    search = _Search(given, whole("max_steps", max_steps), log)
     try:
         stopped = search.run(has_noise)
     except KeyboardInterrupt:
@@ -129,6 +136,16 @@ def identify(
         with contextlib.suppress(KeyboardInterrupt):
             search.keep_best()
     return _identified(search, stopped, held_out, has_noise)
+
+
+def as_text(step: int, metrics: dict[str, float], has_noise: bool) -> str:
+    """Return what the log of `identify` is given as a sentence."""
+    part = "" if metrics["share"] == 1 else f" over the first {100 * metrics['share']:.0f} %"
+    num, index, count = (int(metrics[name]) for name in ("motions", "start", "starts"))
+    doing = f", other start {index} of {count}" if index else f", best of {count} other starts" if count > 1 else ""
+    doing += f", mean of {num} motions" if num > 1 else ""
+    error = f"error {metrics['rms']:.3g} times the {'noise' if has_noise else 'motion'}"
+    return f"step {step}: {error}{part}{doing}, about {duration(max(metrics['seconds'], 1))} to go"
 
 
 def outlook(

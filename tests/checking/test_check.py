@@ -6,6 +6,7 @@ import importlib
 import re
 import threading
 import time
+import types
 import warnings
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
+from mjxgrad import _text
 from mjxgrad.checking import findings
 from mjxgrad.checking.check import _warned, program, telling
 from mjxgrad.checking.findings import headline, left_out_findings, measured_findings, price_finding, recommend
@@ -544,6 +546,17 @@ def test_the_code_has_a_cost_by_its_name(tmp_path):
 def test_a_slope_that_was_not_measured_is_taken_where_it_is_cheap(measuring, price, gradient):
     _, advise = measuring
     assert advise(None, price).gradient == gradient
+
+
+@pytest.mark.parametrize("progress", [True, False])
+def test_a_long_check_tells_what_it_does_from_its_third_second_on_and_every_ten(monkeypatch, capfd, progress):
+    """By a clock of its own: after 3 s something is told, 2 s later nothing, and after 10 more something again."""
+    now = iter([0.0, 3.0, 3.0, 5.0, 15.0, 15.0, *[15.0] * 20])
+    monkeypatch.setattr(_text, "time", types.SimpleNamespace(monotonic=lambda: next(now)))
+    mg.check(ball(gear=0, height=0.05), derivatives=False, progress=progress)
+    told = capfd.readouterr().err.splitlines()
+    assert len(told) == 2 * progress
+    assert all(one.startswith("check: ") and one.endswith("; Ctrl-C keeps what was found") for one in told)
 
 
 def test_a_program_of_slow_steps_has_fewer_samples_and_foretells_its_time(bounce):
