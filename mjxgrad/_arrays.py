@@ -47,6 +47,19 @@ def is_known(value: Any) -> bool:
     return isinstance(value, jax.Array | np.ndarray) and not isinstance(value, jax.core.Tracer)
 
 
+class Legible(eqx.Module):
+    """A module that is printed with its numbers, where they are known, and not with their types."""
+
+    def __repr__(self) -> str:
+        return eqx.tree_pformat(jax.tree.map(_shown, self))
+
+
+def _shown(leaf: Any) -> Any:
+    if not is_known(leaf) or leaf.ndim or jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
+        return leaf
+    return float(f"{leaf:.4g}") if jnp.issubdtype(leaf.dtype, np.floating) else leaf.item()
+
+
 def is_known_to_be(number: float, values: Any, *, column: int | None = None) -> bool:
     """Return whether all numbers of an array, or one of its columns, are known to equal a value."""
     found = known(values)

@@ -137,9 +137,9 @@ def _length(x: Float[Array, " n"]) -> Float[Array, ""]:
 def apg(**changes: Any) -> learning.Settings:
     """Return the settings of analytic policy gradients in brax, with which MuJoCo's notebook learns to trot.
 
-    There is no value function, and windows follow one another. Two things differ from brax. The noise is not learned but
-    falls linearly from 0.07 to 0.01, and being so small does not limit a step. Gradients are clipped by their norm, not by number, and long derivatives are shortened,
-    which allows larger rates.
+    There is no value function, and windows follow one another. Three things differ from brax. The noise is not learned but
+    falls linearly from 0.07 to 0.01; being so small, it limits no step. Gradients are clipped by their norm, not by number,
+    and long derivatives are shortened, which allows larger rates.
 
     References:
         Freeman et al. Brax: A Differentiable Physics Engine for Large Scale Rigid Body Simulation. arXiv:2106.13281

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjxgrad._arrays import as_float, is_known
+from mjxgrad._arrays import Legible, as_float, is_known
 from mjxgrad._mjx import mjx
 from mjxgrad.batched.maps import safe_sqrt
 from mjxgrad.contact.law import compensated_stiffness
@@ -41,7 +41,7 @@ _REQUIREMENTS: dict[str, tuple[Callable[[Any], Any], str]] = {
 }
 
 
-class Softness(eqx.Module):
+class Softness(Legible):
     r"""Contact softness, set consistently on all pairs of geoms or on a subset.
 
     Stiffness and damping are written in MuJoCo's direct format, solref $= (-k, -b)$ with $b = 2 \zeta \sqrt k$. In the

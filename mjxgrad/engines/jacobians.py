@@ -306,8 +306,12 @@ class Worker:
             one.begun.lost = lost
         if len(one.near.rough):
             by_rest = matrix[:, :nv] @ rest
-            self._visibly(one, rest, by_rest)
-            matrix[:, :nv] = by_rest
+            visible = by_rest.copy()
+            self._visibly(one, rest, visible)
+            # Beyond any contact's stiffness are points of contact that jump, by as much however close to a surface one looks.
+            steep = self._steepness(visible) > _STEEP / self.model.opt.timestep
+            steep &= self._steepness(by_rest) <= _STEEP / self.model.opt.timestep
+            matrix[:, :nv] = np.where(steep, by_rest, visible)
         elif events is not None:
             matrix[:, :nv] = matrix[:, :nv] @ rest
         if one.begun is not None and "apart" not in one.found:  # nobody follows them
@@ -413,7 +417,7 @@ class Worker:
             row = layout.moved(row, 8 * change)
         return row
 
-    def _steepness(self, matrix: Float[np.ndarray, "... size size"]) -> Float[np.ndarray, "... nv"]:
+    def _steepness(self, matrix: Float[np.ndarray, "... size columns"]) -> Float[np.ndarray, "... nv"]:
         """Return the largest change of a velocity with each position, both of the farthest points that they move (1/s)."""
         lengths = self.surfaces.lengths
         nv = len(lengths)

@@ -227,8 +227,7 @@ def observed(
     """Return what a function of model and data sees where the readings of sensors are known, and places by kinematics."""
     known = {"qpos": state.qpos, "qvel": state.qvel, "act": state.act, "ctrl": ctrl, "time": state.time, **inputs}
     at = data_of(scene, state, ctrl).replace(**inputs)
-    placed = com_pos(scene.model, kinematics(scene.model, at))
-    known |= {name: getattr(placed, name) for name in _PLACES if hasattr(placed, name)} | {"sensordata": readings}
+    known |= _places(scene.model, at) | {"sensordata": readings}
 
     def unknown(value: Any) -> Any:
         is_number = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
@@ -237,3 +236,10 @@ def observed(
     # Forces and accelerations that only MuJoCo has would be zeros of the template.
     data: mjx.Data = jax.tree.map(unknown, scene.data).replace(**known, _impl=_Unknown())
     return observe(scene.model.replace(sensor_needstage=scene.mj_model.sensor_needstage), data)  # pyright: ignore[reportCallIssue]
+
+
+# Operation by operation 250 programs would be compiled, for 10 s.
+@eqx.filter_jit
+def _places(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
+    placed = com_pos(model, kinematics(model, data))
+    return {name: getattr(placed, name) for name in _PLACES if hasattr(placed, name)}

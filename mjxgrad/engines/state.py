@@ -3,12 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from mjxgrad._arrays import instance, is_known
+from mjxgrad._arrays import Legible, instance
 from mjxgrad._mjx import mjx
 from mjxgrad.scene import Scene
 from mjxgrad.stepping.pairs import Flight
@@ -48,7 +47,7 @@ class State(eqx.Module):
     pairs: Pairs | Flight | None = eqx.field(default=None, repr=False)
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Legible):
     """The course of one rollout; under `jax.vmap` every field gains leading axes.
 
     Attributes:
@@ -83,20 +82,10 @@ class Trajectory(eqx.Module):
     act: Float[Array, "states na"] | None = None
     seen: PyTree = None
 
-    def __repr__(self) -> str:
-        return eqx.tree_pformat(jax.tree.map(_shown, self))
-
     @property
     def explodes(self) -> Bool[Array, "*batch"]:
         """Whether the derivative has grown a thousandfold, or is not finite. False if growth was not measured."""
         return jnp.zeros_like(self.diverged) if self.growth is None else self.growth > LARGEST_GROWTH
-
-
-def _shown(leaf: Any) -> Any:
-    """Return a known number, so that it is printed as such and not as an array's form; anything else unchanged."""
-    if not is_known(leaf) or leaf.ndim or jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
-        return leaf
-    return float(f"{leaf:.4g}") if jnp.issubdtype(leaf.dtype, np.floating) else leaf.item()
 
 
 def data_of(scene: Scene, state: State, ctrl: Float[Array, " nu"]) -> mjx.Data:

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from mjxgrad._arrays import instance, is_known, known, real, whole
+from mjxgrad._arrays import Legible, instance, is_known, known, real, whole
 from mjxgrad._text import name_pairs
 from mjxgrad.planning.system import ControlVector, SceneSystem, StateVector, System, resting
 from mjxgrad.stepping import Smoothing
@@ -55,7 +55,7 @@ class LinearModel(eqx.Module):
     B: Float[Array, "*steps n m"]
 
 
-class Smoother(eqx.Module):
+class Smoother(Legible):
     """A smoothed step with its derivative. The same key gives the same step, so that costs can be compared."""
 
     @abstractmethod

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from mjxgrad._arrays import function, known, real, traceable, whole
+from mjxgrad._arrays import Legible, function, known, real, traceable, whole
 from mjxgrad._mjx import mjx
 from mjxgrad._programs import compiled
 from mjxgrad.bodies.kinematics import integrate_position, kinematics, position_change
@@ -253,7 +253,7 @@ def resting(model: mujoco.MjModel, qpos: Float[ArrayLike, " nq"]) -> Int[np.ndar
     return pairs[(model.body_weldid[model.geom_bodyid] == 0)[pairs].any(axis=1)]
 
 
-class Cost(eqx.Module):
+class Cost(Legible):
     """A cost of states and controls; a subclass gives `stage` and `terminal`, twice differentiable."""
 
     @abstractmethod

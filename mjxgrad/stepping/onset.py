@@ -60,7 +60,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import as_float, is_known
+from mjxgrad._arrays import Legible, as_float, is_known
 from mjxgrad._mjx import mjx
 from mjxgrad.batched.maps import safe_norm, safe_sqrt
 from mjxgrad.bodies.kinematics import com_vel
@@ -86,7 +86,7 @@ _IMPACT = 1e3
 _GRAVITY = 9.81  # gravity (m/s²) that separates impacts from chatter in scenes without gravity
 
 
-class Onset(eqx.Module):
+class Onset(Legible):
     """Contacts and limits that begin within the step; see `mjxgrad.stepping.onset`.
 
     A pytree: a sweep over the width is one `jax.vmap`, and the step can be differentiated by it.

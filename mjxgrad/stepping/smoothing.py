@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mjxgrad._arrays import as_float, is_known, one_of
+from mjxgrad._arrays import Legible, as_float, is_known, one_of
 from mjxgrad._mjx import mjx
 from mjxgrad.contact.collision import CONVEX, are, is_blind
 from mjxgrad.contact.law import impedance, stiffness_damping
@@ -46,7 +46,7 @@ _SOFTEST = 1e-3
 _WEIGHTLESS = 1e30
 
 
-class Smoothing(eqx.Module):
+class Smoothing(Legible):
     """Noise on the distance of every contact, averaged in the solver without sampling.
 
     A pytree whose lengths are leaves: a sweep over them is one `jax.vmap`, and the step can be differentiated by them.
