@@ -19,7 +19,7 @@ from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
 from mjxgrad.planning.linear_model import Exact, Smoother
 from mjxgrad.planning.system import Cost, SceneSystem, System
-from mjxgrad.planning.trajectory import Course, Problem, deviations, posed, random_changes
+from mjxgrad.planning.trajectory import FREE, Course, Problem, deviations, posed, random_changes
 from mjxgrad.rollouts import State
 
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
@@ -225,7 +225,9 @@ class Controller(Printed):
         states[0] = start
         unknown = jax.device_put(np.full_like(search.best.cost, np.inf))
         course = Course(jax.device_put(states), search.best.controls, unknown)
-        self._search = dataclasses.replace(search, course=course, best=course)
+        # What no step of an old model improved says little of the next one, and a model that may not move promises nothing.
+        held = np.minimum(np.asarray(search.regularisation), FREE).astype(states.dtype)
+        self._search = dataclasses.replace(search, course=course, best=course, regularisation=jax.device_put(held))
         self._turn = self._iteration.moved_on(self._turn)
 
     def _advance(self, turn: Turn, factors: tuple[Any, Any], *, is_first: bool = False) -> None:

@@ -25,7 +25,7 @@ _Matrix = Float[Array, "m m"]
 _Controls = Float[Array, "horizon m"]
 _STEPS = (1.0, 0.6, 0.3, 0.1, 0.03)
 _LEAST_REGULARISATION, _MOST_REGULARISATION = 1e-6, 1e6
-_FREE = 1.0  # regularisation up to which a step may go about as far as its model says
+FREE = 1.0  # regularisation up to which a step may go about as far as its model says
 # A plan has converged once its model predicts to lower the cost by no more than this share of it.
 _TOLERANCE = 1e-4
 # An influence of controls on a coordinate counts as zero below this share of the largest influence: roundings of differences.
@@ -397,7 +397,7 @@ def _improved(
     found, (rows, held) = jax.lax.scan(iterate, problem.begin(start, controls), inputs)
     start_cost, (rows, held) = rows.cost[0], jax.tree.map(lambda x: x[1:], (rows, held))
     # What is held to the controls as they are promises nothing, either.
-    promised = rows.promised[jnp.max(jnp.where(held <= _FREE, jnp.arange(len(held)), 0))]
+    promised = rows.promised[jnp.max(jnp.where(held <= FREE, jnp.arange(len(held)), 0))]
     return Plan(
         controls=found.best.controls,
         states=found.best.states,

@@ -1,5 +1,6 @@
 """Control by receding horizon: a pole that must stand, the clock, and where each decision begins."""
 
+import dataclasses
 import warnings
 from types import SimpleNamespace
 
@@ -77,6 +78,23 @@ def test_without_time_a_decision_is_a_part_of_an_iteration_and_counts_as_missed(
         assert np.isfinite(controller(START)).all()
         assert (controller.num_missed, len(taken)) == (num_missed, first + num_missed)
     assert ", 2 missed 1e-6 ms, 2 cut short. An iteration took " in str(controller)
+
+
+def test_a_decision_is_free_of_what_the_last_one_failed_at(controller, monkeypatch):
+    """The goal moves when no step had lowered the cost for long: regularisation held a loader still for good."""
+    monkeypatch.setattr(controller, "deadline", None)
+
+    def lowered(regularisation):
+        controller.reset()
+        controller.cost = COST
+        controller(START)
+        held = jnp.asarray(regularisation, controller._search.regularisation.dtype)
+        controller._search = dataclasses.replace(controller._search, regularisation=held)
+        controller.cost = GoalCost(jnp.array([2.0, 0.0]), 1.0, 10.0, 0.1)
+        controller(START)
+        return float(controller.plan.cost)
+
+    assert lowered(1e6) < 1.1 * lowered(1e-6)
 
 
 def test_what_decisions_took_is_one_rate(controller):
