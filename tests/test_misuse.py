@@ -208,7 +208,7 @@ FOUND = {
     "roll(horizon=2, inputs={'qfrc_applied': jnp.zeros(3)})": "inputs['qfrc_applied'] must have shape (2, 1), one row per step",
     "mg.initial_state(scene, qpos=jnp.zeros(3))": "qpos must have shape (1,) in this scene, got (3,)",
     "mg.initial_state(balls, qpos=jnp.zeros(14))": "quaternion that is not zero, got zeros for root",
-    "mg.initial_state(scene, qpos=jnp.array([jnp.nan]))": "qpos must be finite",
+    "mg.initial_state(scene, qpos=jnp.array([jnp.nan]))": "qpos must be finite, got nan at 0",
     # Contact in a step.
     "mg.Onset(-0.1)": "width must be finite and not negative",
     "mg.step(balls.model, balls.data, contact=mg.Onset(jnp.ones(3)))": "width must be one value",
@@ -412,6 +412,7 @@ FOUND = {
     "identify(recordings=['a.csv'])": "recordings must be of mg.identification.Recording, got str",
     "mg.identify(scene, {'a': 1.0}, [fit.Recording({'qpos': five})])": "parameters must be of mg.identification, such as",
     "fit.friction(scene)": "geoms that can touch, got none",
+    "fit.friction(balls, 'floor/ball', 'ball')": "contacts must be named by geoms, or by pairs geom/geom, got floor/ball, ball",
     "mg.learning.learn(cart, key, num_updates=1, settings={})": "settings must be of mg.learning.Settings, got dict",
     "mg.learning.learn(cart, key, num_updates=1, checkpoint='/no/x.npz')": "checkpoint must be in a folder that exists",
     "planned(controls=np.full((3, 2), np.nan))": "controls must be finite",

@@ -3,13 +3,11 @@
 import csv
 import dataclasses
 import difflib
-import functools
 import os
 import re
 import zipfile
 from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -44,7 +42,9 @@ def parameter(scene: Scene, text: str) -> Parameter:
     field, _, column = (match[1] if match else "").rstrip("]").partition("[")
     is_field = field not in KINDS and field in numbers_of(scene.model)
     if match is None or not (match[1] in KINDS or is_field):
-        raise ValueError(f"a parameter must be kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}")
+        near = difflib.get_close_matches(field, [*KINDS, *numbers_of(scene.model)], 1)
+        more = f"; did you mean {near[0]}?" if near else ", or a field of the model such as body_pos[2]"
+        raise ValueError(f"a parameter must be kind:name=low..high, kind one of {', '.join(KINDS)}; got {text!r}{more}")
     kind, names = match[1], tuple((match[2] or "").split(",")) if match[2] else ()
     try:
         bounds = None if match[3] is None else (float(match[3]), float(match[4]))
@@ -56,14 +56,10 @@ def parameter(scene: Scene, text: str) -> Parameter:
             raise ValueError(f"delay must be of all controls and at least 0 s, delay or delay=low..high, got {text!r}")
         return Parameter(low, low, high, unit="s")
     if kind == "friction" or kind in _SOFTNESS:
-        pairs = tuple(tuple(name.split("/")) for name in names if "/" in name)
-        if pairs and (len(pairs) < len(names) or any(len(pair) != 2 for pair in pairs)):
-            raise ValueError(f"contacts must be named by geoms, or by pairs geom/geom, got {text!r}")
-        subset: dict[str, Any] = {"pairs": pairs} if pairs else {"geoms": names} if names else {}
-        if bounds is not None:
-            subset["bounds"] = bounds
-        make = parameters.friction if kind == "friction" else functools.partial(parameters.softness, part=kind)
-        return make(scene, **subset)
+        given = {} if bounds is None else {"bounds": bounds}
+        if kind == "friction":
+            return parameters.friction(scene, *names, **given)
+        return parameters.softness(scene, kind, *names, **given)
     if not names:
         raise ValueError(f"{kind} must say of what, {kind}:name, got {text!r}")
     if is_field:

@@ -34,6 +34,10 @@ _OBJECTS = {
     "site": _Object.mjOBJ_SITE, "actuator": _Object.mjOBJ_ACTUATOR, "tendon": _Object.mjOBJ_TENDON,
 }  # fmt: skip
 _POSITIVE = ("dof_damping", "dof_armature", "dof_frictionloss", "body_mass", "geom_size", "jnt_stiffness")
+_UNITS = {  # of slides, and of hinges
+    "dof_damping": ("N s/m", "N m s/rad"), "dof_armature": ("kg", "kg m²"), "dof_frictionloss": ("N", "N m"),
+    "jnt_stiffness": ("N/m", "N m/rad"),
+}  # fmt: skip
 _FACTOR = 10.0  # positive numbers are bounded by a tenth and ten times the model's value
 _AT_BOUND = 1e-6  # share of the range
 _NEAR = 1e-3  # of a number's scale, by which it is changed to see what follows
@@ -212,10 +216,11 @@ def mass(scene: Scene, *bodies: str, bounds: Bounds = None) -> Parameter:
     return _positive(nominal, bounds, write, "kg", "mass")
 
 
-def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset: Any) -> Parameter:
+def friction(scene: Scene, *contacts: str, bounds: tuple[float, float] = (0.0, 2.0), **subset: Any) -> Parameter:
     """Return the common sliding friction of the selected contacts; all geoms that determine it receive the value.
 
-    The contacts are selected by `pairs` or `geoms`, as in `Softness`; all by default.
+    The contacts are named by geoms, or by pairs such as "floor/foot"; or selected by `pairs` or `geoms`, as in `Softness`. They
+    are all by default.
 
     Warns:
         SceneWarning: if the contacts differ in the scene, and become alike.
@@ -223,7 +228,7 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
     Raises:
         ValueError: if a name is unknown or can touch nothing.
     """
-    named = Softness(**subset)
+    named = Softness(**_selected(contacts, subset))
     present = np.asarray(_touching(scene, named).friction)[:, 0]
     if np.ptp(present) > 0:
         listed = name_pairs(named.selected(scene.model))
@@ -244,7 +249,17 @@ def friction(scene: Scene, *, bounds: tuple[float, float] = (0.0, 2.0), **subset
     return _positive(float(present[0]), bounds, write, "", "friction")
 
 
-def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -> Parameter:
+def _selected(contacts: tuple[str, ...], subset: dict[str, Any]) -> dict[str, Any]:
+    """Return names of geoms, or of pairs, as arguments of `Softness`."""
+    if not contacts:
+        return subset
+    pairs = tuple(tuple(str(name).split("/")) for name in contacts if "/" in str(name))
+    if subset or (pairs and (len(pairs) < len(contacts) or any(len(pair) != 2 for pair in pairs))):
+        raise ValueError(f"contacts must be named by geoms, or by pairs geom/geom, got {', '.join(map(str, contacts))}")
+    return {"pairs": pairs} if pairs else {"geoms": contacts}
+
+
+def softness(scene: Scene, part: str, *contacts: str, bounds: Bounds = None, **subset: Any) -> Parameter:
     """Return one part of the softness of the selected contacts; contacts as in `friction`, bounds as in `mass`.
 
     The parts are "stiffness" (1/s²), "damping_ratio", which determines the restitution, and "width" (m).
@@ -255,6 +270,7 @@ def softness(scene: Scene, part: str, *, bounds: Bounds = None, **subset: Any) -
     units = {"stiffness": "1/s²", "damping_ratio": "", "width": "m"}
     if part not in units:
         raise ValueError(f"part must be one of {', '.join(units)}, got {part!r}")
+    subset = _selected(contacts, subset)
 
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
         after = Softness(**{part: value}, **subset).apply(model)
@@ -324,7 +340,18 @@ def number(scene: Scene, field: str, *names: str, column: int | None = None, bou
     def write(model: mjx.Model, value: Array) -> dict[str, Array]:
         return {field: getattr(model, field).at[place].set(value)}
 
-    return _positive(float(value[place][0]), bounds, write, "", field.removeprefix("dof_"), field in _POSITIVE)
+    unit = _unit(scene.mj_model, field, index)
+    return _positive(float(value[place][0]), bounds, write, unit, field.removeprefix("dof_"), field in _POSITIVE)
+
+
+def _unit(model: mujoco.MjModel, field: str, index: np.ndarray) -> str:
+    """Return the unit of a number of slides or of hinges; of others nothing."""
+    if field not in _UNITS:
+        return ""
+    kinds = set(model.jnt_type[model.dof_jntid[index] if field.startswith("dof") else index].tolist())
+    of_slides, of_hinges = _UNITS[field]
+    known = {mujoco.mjtJoint.mjJNT_SLIDE.value: of_slides, mujoco.mjtJoint.mjJNT_HINGE.value: of_hinges}
+    return known.get(kinds.pop(), "") if len(kinds) == 1 else ""
 
 
 def gains(scene: Scene, *actuators: str, bounds: tuple[Any, Any] | None = None) -> Parameter:

@@ -49,7 +49,9 @@ def initial_state(
         if part.shape != template.shape:
             raise ValueError(f"{name} must have shape {template.shape} in this scene, got {part.shape}")
         if is_known(part) and not np.isfinite(part).all():
-            raise ValueError(f"{name} must be finite, got {np.asarray(part).tolist()}")
+            bad = np.flatnonzero(~np.isfinite(part))
+            where = f"{np.asarray(part)[bad[0]]} at {bad[0]}" + f" and {len(bad) - 1} more" * (len(bad) > 1)
+            raise ValueError(f"{name} must be finite, got {where}")
         parts.append(part)
     for message in pose_warnings(scene.model, scene.mj_model if qpos is None else None, parts[0]):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)

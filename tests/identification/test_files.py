@@ -156,6 +156,7 @@ def test_parameters_are_named_in_a_word(scene):
     assert (found["mass:cart"].nominal, found["mass:cart"].upper, found["delay"].upper) == (2.0, 3.0, 0.1)
     refused = {
         "weight:cart": "kind one of mass",
+        "mas:cart": "did you mean mass?",
         "mass": "must say of what",
         "gear:no": "no",
         "mass:cart=-1..1": "negative",

@@ -67,7 +67,7 @@ def test_makers_write_what_they_say(scene):
     """Each of them at twice its nominal value, read from the model."""
     made = {
         "mass": identification.mass(scene, "ball"),
-        "friction": identification.friction(scene, pairs=(("floor", "ball"),)),
+        "friction": identification.friction(scene, "floor/ball"),
         "damping": identification.damping(scene, "hinge"),
         "armature": identification.armature(scene, "hinge"),
         "gear": identification.gear(scene, "motor"),
@@ -77,6 +77,8 @@ def test_makers_write_what_they_say(scene):
     expected = {"mass": 2.0, "friction": 1.0, "damping": 2.0, "armature": 0.3, "gear": 3.0, "gains": [50.0, 4.0]}
     for name, value in expected.items():
         np.testing.assert_allclose(made[name].nominal, value, err_msg=name)
+    units = {name: one.unit for name, one in made.items() if one.unit}
+    assert units == {"mass": "kg", "damping": "N m s/rad", "armature": "kg m²"}
     changed = write_all(scene, made, {name: jnp.asarray(2 * one.nominal) for name, one in made.items()})
     before, after = scene.model, changed.model
     np.testing.assert_allclose(after.body_mass, [0, 0.5, 4])
