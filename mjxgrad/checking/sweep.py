@@ -413,7 +413,7 @@ def sweep(
     given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
     given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
 
-    def progress(done: int, total: int) -> None:
+    def advanced(done: int, total: int) -> None:
         began.append(time.perf_counter())  # first, when all is compiled
         if (part := 8 * done // total) > last[0] and done > 1:
             last[0] = part
@@ -431,7 +431,7 @@ def sweep(
     say(f"{what}, by {by.title}; {first}")
     if why:
         say(f"derivatives are those of each step{why}")
-    result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=progress, **given)
+    result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=advanced, **given)
     called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
     contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
     kinds = {"slope": "the slope of the outcome", "discrete": "that of each step"}
