@@ -75,7 +75,7 @@ def paced(name: str) -> Callable[[str], None]:
     def say(text: str) -> None:
         if time.monotonic() > due[0]:
             due[0] = time.monotonic() + 10.0
-            print(f"{name}: {text}; Ctrl-C keeps what was found", file=sys.stderr, flush=True)
+            print(f"{name}: {text.rstrip('.')}; Ctrl-C keeps what was found", file=sys.stderr, flush=True)
 
     return say
 

@@ -323,13 +323,13 @@ def recommend(
 ) -> Recommendation:
     """Return the recommended settings from measurements and the price of a slope in that of a discrete derivative.
 
-    Where nothing was measured, nothing speaks against the slope but its price.
+    Where nothing was measured, nothing speaks against the slope but its price; infinity is one that is not known.
     """
     needed = [_largest_step(spring) for spring in _steps_too_long(stability)]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
-        gradient = "slope" if price <= _MOST_UNMEASURED else "discrete"
+        gradient = "discrete" if _MOST_UNMEASURED < price < math.inf else "slope"
         return Recommendation(gradient, "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
     found = slopes(measured.lines)
     touches = bool(motions.touches or motions.touching)

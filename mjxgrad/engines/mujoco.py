@@ -238,7 +238,7 @@ def observed(
     return observe(scene.model.replace(sensor_needstage=scene.mj_model.sensor_needstage), data)  # pyright: ignore[reportCallIssue]
 
 
-# Operation by operation 250 programs would be compiled, for 10 s.
+# Operation by operation 200 small programs would be compiled instead of this one.
 @eqx.filter_jit
 def _places(model: mjx.Model, data: mjx.Data) -> dict[str, Array]:
     placed = com_pos(model, kinematics(model, data))

@@ -542,8 +542,9 @@ def test_the_code_has_a_cost_by_its_name(tmp_path):
     np.testing.assert_allclose(names["cost"](ended), -0.3 - ended.qpos[-1, 0], rtol=1e-12)
 
 
-@pytest.mark.parametrize(("price", "gradient"), [(3.0, "slope"), (10.0, "discrete")])
+@pytest.mark.parametrize(("price", "gradient"), [(3.0, "slope"), (10.0, "discrete"), (np.inf, "slope")])
 def test_a_slope_that_was_not_measured_is_taken_where_it_is_cheap(measuring, price, gradient):
+    """Or where its price is not known, as in scenes without actuators."""
     _, advise = measuring
     assert advise(None, price).gradient == gradient
 
@@ -557,6 +558,7 @@ def test_a_long_check_tells_what_it_does_from_its_third_second_on_and_every_ten(
     told = capfd.readouterr().err.splitlines()
     assert len(told) == 2 * progress
     assert all(one.startswith("check: ") and one.endswith("; Ctrl-C keeps what was found") for one in told)
+    assert not any(".;" in one for one in told)
 
 
 def test_a_program_of_slow_steps_has_fewer_samples_and_foretells_its_time(bounce):
