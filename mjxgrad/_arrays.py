@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+_MOST_SHOWN = 24  # numbers of a vector that are printed in full
+
 
 def as_float(value: Any, name: str = "softness") -> Any:
     """Return numbers as an array of floats, also integers (10000 is a natural stiffness); None stays None."""
@@ -54,9 +56,22 @@ class Legible(eqx.Module):
         return eqx.tree_pformat(jax.tree.map(_shown, self))
 
 
+class _Verbatim(str):
+    """Text that is printed without quotation marks."""
+
+    __repr__ = str.__str__
+
+
 def _shown(leaf: Any) -> Any:
-    if not is_known(leaf) or leaf.ndim or jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
+    if not is_known(leaf) or leaf.ndim > 1 or not leaf.size or jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
         return leaf
+    if leaf.ndim:
+        numbers = np.array2string(
+            np.asarray(leaf), formatter={"float_kind": "{:.4g}".format}, threshold=_MOST_SHOWN, max_line_width=300
+        )
+        return _Verbatim(
+            numbers if leaf.size <= _MOST_SHOWN else f"{jax.typeof(leaf).str_short(short_dtypes=True)} {numbers}"
+        )
     return float(f"{leaf:.4g}") if jnp.issubdtype(leaf.dtype, np.floating) else leaf.item()
 
 

@@ -25,7 +25,7 @@ class Pairs(eqx.Module):
     held: Float[Array, " slots"]  # zeros, whose derivative is what each pair has felt of a change
 
 
-class State(eqx.Module):
+class State(Legible):
     """The state before a step.
 
     Attributes:

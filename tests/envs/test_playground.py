@@ -1,8 +1,11 @@
 """Playground's and brax's environments by our step: their motion, a derivative that is its slope, and nothing left behind."""
 
+import dataclasses
 import re
 import struct
+import sys
 import threading
+import types
 from pathlib import Path
 
 import jax
@@ -12,7 +15,8 @@ import numpy as np
 import pytest
 
 from mjxgrad.envs import playground
-from mjxgrad.stepping import Slope
+from mjxgrad.learning import Settings, learn
+from mjxgrad.stepping import Slope, forward
 
 # How many actions, and what is to be known: noise on observations and pushes have keys of their own.
 NAMES = {
@@ -77,6 +81,31 @@ def test_other_threads_step_as_ever(falling, monkeypatch):
     thread.start()
     thread.join()
     assert len(results) == 1
+
+
+@pytest.mark.parametrize(("place", "slope"), [(0.5, 1.0), (1.0, 0.0), (2.0, 0.0)])
+def test_within_bounds_a_tolerance_has_the_derivative_zero(monkeypatch, place, slope):
+    """Playground's formula, linear below 1 for brevity: by itself the derivative from 1 on is no number."""
+    reward = types.ModuleType("reward")
+
+    def tolerance(x, bounds):
+        distance = jnp.where(x < bounds[0], bounds[0] - x, x - bounds[1])
+        return jnp.where((bounds[0] <= x) & (x <= bounds[1]), 1.0, 1 - distance + 0.0 * jnp.exp(-(distance**2)))
+
+    class Standing:
+        def reset(self):
+            return None
+
+        def step(self, height):
+            return reward.tolerance(height, bounds=(1.0, jnp.inf))
+
+    reward.tolerance = tolerance
+    monkeypatch.setitem(sys.modules, "mujoco_playground._src.reward", reward)
+    right = playground.stepped_right(Standing())
+    value, derivative = jax.value_and_grad(right.step)(jnp.array(place))
+    assert value == Standing().step(place)
+    assert derivative == slope
+    assert reward.tolerance is tolerance
 
 
 @pytest.fixture(scope="module")
@@ -183,3 +212,61 @@ def test_one_of_braxs_environments_steps_right():
     action, width = jnp.array([0.3]), 1e-5
     slope = (place(action + width)[0] - place(action - width)[0]) / (2 * width)
     np.testing.assert_allclose(place(action)[1][0], slope, rtol=1e-7)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    pytest.importorskip("mujoco_playground", reason="pip install playground")
+    return playground.environment("WalkerWalk", num_starts=4)
+
+
+@pytest.mark.slow
+def test_a_task_has_their_observation_and_reward(walker):
+    """By their functions in the state that their own step leads to; both solves converge, as in the test above."""
+    theirs = playground.load("WalkerWalk")
+    action = jax.random.uniform(jax.random.key(3), (walker.num_actions,), minval=-0.9, maxval=0.9)
+    start = jax.jit(lambda key: walker.reset(key))(jax.random.key(1))
+    stepped = jax.jit(lambda action: walker.step(start, action))(action)
+    data = mujoco.mjx.make_data(theirs.mj_model, impl="jax").replace(qpos=start.physics.qpos, qvel=start.physics.qvel)
+    first = jax.eval_shape(theirs.reset, jax.random.PRNGKey(0))
+    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), first).replace(data=data)
+
+    @jax.jit
+    def told(action):
+        after = forward(theirs.mjx_model, theirs.step(first, action).data)
+        return after.qpos, theirs._get_obs(after, {}), theirs._get_reward(after, action, {}, {})
+
+    for ours, reference in zip((stepped.physics.qpos, stepped.obs, stepped.reward), told(action), strict=True):
+        np.testing.assert_allclose(ours, reference, rtol=1e-7, atol=1e-7)
+    assert (walker.frame_skip, walker.episode_length, float(walker.interval)) == (10, 1000, 0.025)
+
+
+@pytest.mark.slow
+def test_the_reward_of_standing_has_a_derivative(walker):
+    """Upright and taller than 1.2 m: only a speed below 1 m/s changes the reward."""
+    rest = walker.start(jax.random.key(0))
+
+    @jax.jit
+    def reward(speed):
+        state = dataclasses.replace(rest, qpos=0 * rest.qpos, qvel=jnp.zeros(9).at[1].set(speed))
+        return walker.rewards(state, jnp.zeros(6), state, None)["task"]
+
+    value, slope = jax.jit(jax.value_and_grad(reward))(0.8)
+    width = 1e-6
+    np.testing.assert_allclose(slope, (reward(0.8 + width) - reward(0.8 - width)) / (2 * width), rtol=1e-6)
+    assert 0 < value < 1
+    assert slope > 0
+
+
+@pytest.mark.slow
+def test_a_task_is_learnt(walker):
+    settings = Settings(num_environments=4, window=2, actor_layers=(8,), critic_layers=(8,))
+    learned = learn(walker, jax.random.key(0), num_updates=2, settings=settings, progress=False)
+    assert jnp.isfinite(learned.history["reward"]).all()
+    np.testing.assert_array_equal(learned.history["not_finite"], 0.0)
+
+
+@pytest.mark.slow
+def test_tasks_of_other_suites_are_refused(menagerie):
+    with pytest.raises(ValueError, match="dm_control suite without targets that move, got 'Go1Joystick"):
+        playground.environment("Go1JoystickFlatTerrain")

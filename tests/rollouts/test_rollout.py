@@ -1,6 +1,5 @@
 """Rollouts: what is kept, what is flagged, what is refused."""
 
-import dataclasses
 import re
 import warnings
 
@@ -74,6 +73,11 @@ def test_a_trajectory_is_shown_with_the_numbers_that_are_known(scene, controls):
     assert f"growth={float(course.growth):.4g}," in shown[1]
     assert "diverged=bool[]," in shown[0]
     assert "qpos=f64[7,2]," in shown[1]
+    assert "f64[2]" not in shown[1]  # the last state's vectors are short, and shown as numbers
+    last = [f"{x:.4g}" for x in course.final.qpos.tolist()]
+    assert f"qpos=[{' '.join(last)}]," in shown[1]
+    long = mg.State(*map(jnp.zeros, (30, 30, 0, (), 30)))
+    assert f"f64[30] [{'0 ' * 3}... {'0 ' * 2}0]," in repr(long)
     stepped = scene.with_engine("mujoco")
     assert "pairs" not in repr(mg.rollout(stepped, mg.initial_state(stepped), controls))
 
