@@ -35,6 +35,8 @@ _IDENTIFY = ["identify", "scene.xml", "motion.csv", "--parameter", "mass:ball"]
 @pytest.fixture
 def scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    # Random motions of half a second in place of two, each step of which is asked for its contacts.
+    monkeypatch.setattr("mjxgrad.checking.motions._SECONDS", 0.5)
     Path("scene.xml").write_text(SCENE.format(gear=1))
     return "scene.xml"
 

@@ -69,6 +69,12 @@ def fault(verdict, kind):
     return found
 
 
+@pytest.fixture(autouse=True)
+def short_motions(monkeypatch):
+    """Random motions of half a second in place of two, each step of which is asked for its contacts."""
+    monkeypatch.setattr("mjxgrad.checking.motions._SECONDS", 0.5)
+
+
 @pytest.fixture(scope="module")
 def measured():
     """From a scene to its verdict, of as few motions as a large scene gets."""
@@ -132,7 +138,7 @@ def test_a_control_range_in_degrees_is_named(reach, expected):
 
 
 def test_contact_that_never_touches_is_named():
-    """It falls for two seconds, 20 m."""
+    """It falls for half a second, 1.2 of 40 m."""
     assert "floor – ball" in fault(quick(ball(height=40, gear=0.1)), "no_contact")
 
 

@@ -32,6 +32,12 @@ def cart():
     return mg.load_scene(_CART)
 
 
+@pytest.fixture
+def few_starts(monkeypatch):
+    """Of other starts an eighth is compared: a cart with one parameter has one minimum, and each start costs a model."""
+    monkeypatch.setattr("mjxgrad.identification.search._SCATTERED", 64)
+
+
 def _interrupted(step, _):
     if step:
         raise KeyboardInterrupt
@@ -113,6 +119,7 @@ def test_a_first_row_far_from_an_exact_start_and_angles_in_degrees_are_told():
         assert all(said in text for text in texts)
 
 
+@pytest.mark.usefixtures("few_starts")
 @pytest.mark.parametrize(
     ("error", "stopped"), [(KeyboardInterrupt, Stopped.INTERRUPTED), (mg.DivergedError, Stopped.STALLED)]
 )
@@ -130,6 +137,7 @@ def test_an_ensemble_that_fails_keeps_the_values_found_before(cart, monkeypatch,
     np.testing.assert_allclose(result.values["gear"], 3.3, atol=0.1)
 
 
+@pytest.mark.usefixtures("few_starts")
 @pytest.mark.parametrize("knows_noise", [True, False])
 def test_values_that_explain_nothing_are_not_called_found(cart, knows_noise):
     """A recording of noise alone: no gear makes it, whether its size is stated or not."""
@@ -148,6 +156,7 @@ def test_values_that_explain_nothing_are_not_called_found(cart, knows_noise):
     assert ("times the noise" in result.headline) == knows_noise
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_scene_that_is_already_right_is_called_found_though_nothing_got_better(cart):
     """What is left is noise of 0.5 % of the motion, which the recording does not state."""
     course = _course()
@@ -307,6 +316,7 @@ def test_windows_begin_where_the_recording_was_and_turns_are_compared_by_their_a
     np.testing.assert_allclose(found[25, :7], [0, 0, 0, -0.04, 0, 0, 0], atol=1e-5)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_start_that_is_not_as_it_was_is_seen_in_the_residuals(cart):
     """0.1 m/s that the recording does not tell: the gear takes them up, and what is left is a curve and no noise.
 
@@ -333,6 +343,7 @@ def test_noise_that_is_overstated_is_told(cart):
         assert any("larger than what is left" in warning for warning in result.warnings()) == told
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_other_data_compile_nothing_and_what_exceeds_the_noise_is_said(cart, compilations):
     """The second cart is pulled by 0.2 N that the scene does not know: no gear explains its motion, and chi-square sees it."""
     results = []
