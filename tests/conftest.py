@@ -37,8 +37,8 @@ gc.set_threshold(200_000, 50, 1000)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # Threads of linear algebra wait for one another by spinning, which two workers on two processors pay for. The matrices here are
-    # small. Workers take this from the process that starts them.
+    # Threads of linear algebra wait for one another by spinning, which two workers on two processors pay for. The matrices
+    # here are small. Workers take this from the process that starts them.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if config.getoption("markexpr") == "not slow":
         os.environ["XLA_FLAGS"] = f"{_QUICK_CODE} {os.environ.get('XLA_FLAGS', '')}"

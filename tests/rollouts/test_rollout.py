@@ -1,5 +1,6 @@
 """Rollouts: what is kept, what is flagged, what is refused."""
 
+import dataclasses
 import re
 import warnings
 
