@@ -17,6 +17,7 @@ from mjxgrad.stepping import Discrete, Onset, Slope, Smoothing, contact_force, f
 
 _mjx.imported()
 _interrupts.lose_none()
+_interrupts.wait_for_programs()
 linearize, optimize = linearise, optimise  # as the field spells them
 
 __all__ = [

@@ -127,7 +127,7 @@ def one_of(name: str, value: Any, choices: Iterable[Any], remedy: str = "") -> N
 def instance(name: str, value: Any, kind: Any, wanted: str) -> None:
     """Refuse a value of another type."""
     if not isinstance(value, kind):
-        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
+        raise ValueError(f"{name} must be {wanted}, got {kind_of(value)}")
 
 
 def function(name: str, value: Any, *arguments: str, is_needed: bool = False) -> None:
@@ -137,7 +137,7 @@ def function(name: str, value: Any, *arguments: str, is_needed: bool = False) ->
             inspect.signature(value).bind(*arguments)  # pyright: ignore[reportArgumentType]
     except TypeError as error:
         wanted = f"{name} must be a function of {' and '.join(arguments)}"
-        raise ValueError(f"{wanted}, got {type(value).__name__}: {error}") from None
+        raise ValueError(f"{wanted}, got {kind_of(value)}: {error}") from None
     except ValueError:  # a function of C without a signature
         return
 
@@ -163,6 +163,12 @@ def takes(function: Any, name: str) -> bool:
     return found is not None
 
 
+def kind_of(value: Any) -> str:
+    """Return the type of anything, or the shape of an array, traced or not, for messages."""
+    is_array = isinstance(value, jax.Array | np.ndarray)
+    return f"an array of shape {value.shape}" if is_array else type(value).__name__
+
+
 def form(value: Any) -> str:
     """Return the shape of numbers, or the type of anything else, for messages."""
     return f"shape {jnp.shape(value)}" if eqx.is_array_like(value) else type(value).__name__
@@ -174,7 +180,7 @@ def one_key(key: Any) -> None:
     shape = () if key is None else jnp.shape(key)
     is_new = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     if not ((is_new and shape == ()) or (dtype == jnp.uint32 and shape == (2,))):
-        given = f"an array of shape {shape}" if shape else repr(key)
+        given = f"an array of shape {shape}" if shape or eqx.is_array(key) else repr(key)
         raise ValueError(f"key must be one of jax.random.key, got {given}; jax.vmap takes several")
 
 

@@ -143,6 +143,8 @@ def check(
     """
     _existing(scene)
     _writable(html, is_page=True, beside=(scene, _source(cost)))
+    if not budget > 0:
+        raise CommandError(f"--budget must be positive, got {budget:g}; --quick measures no derivatives")
     log = _timed()
     log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()

@@ -11,7 +11,8 @@ SETUP = """
 import functools, json, sys, tempfile, warnings
 import equinox as eqx, jax, jax.numpy as jnp, mujoco, numpy as np, optax
 import mjxgrad as mg
-from mjxgrad import diagnostics, envs, estimators, identification as fit, planning
+from mjxgrad import cli, diagnostics, envs, estimators, identification as fit, planning
+from mjxgrad.envs import gym
 from mjxgrad.estimators import rules
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.identification.recording import stack
@@ -121,6 +122,21 @@ class Leaving(planning.Cost):
 
     def terminal(self, system, state):
         return 0.0
+
+
+class Squares(planning.LeastSquares):
+    stages: callable = lambda x: x
+    ends: callable = lambda x: x
+
+    def residuals(self, system, state, control):
+        return self.stages(state)
+
+    def terminal_residuals(self, system, state):
+        return self.ends(state)
+
+
+def squares(**how):
+    return planning.Controller(system, Squares(**how), np.zeros((3, 2)))
 
 
 class Checked(envs.Environment):
@@ -461,6 +477,9 @@ FOUND = {
     "mg.SceneTask(scene, state, len, 2.0)": "horizon must be a whole number, got 2.0",
     "mg.SceneTask(scene, state, len, 0)": "horizon must be at least 1, got 0",
     "mg.sweep(balls, horizon=2.5)": "horizon must be a whole number, got 2.5",
+    "mg.sweep(balls, horizn=10)": "sweep() got an unexpected keyword argument 'horizn'",
+    "mg.sweep(balls, contact='slope')": "contact must be mg.Discrete(), mg.Slope(), mg.Onset() or mg.Smoothing()",
+    "cli.check(archive, budget=-1.0)": "--budget must be positive, got -1; --quick measures no derivatives",
     "mg.sweep(balls, num_samples=0)": "num_samples must be at least 2, got 0",
     "mg.check(balls, seed='a')": "seed must be a whole number, got 'a'",
     "mg.load_scene(scene.mj_model, max_contacts=2.5)": "max_contacts must be a whole number, got 2.5",
@@ -540,7 +559,7 @@ FOUND = {
     "mg.check(scene, 'height')": "there is no body or site ''",
     "mg.check(scene, 'length:ball')": "cost must be file.py:function, module:function, or of a body as height:torso",
     "mg.render.frames(scene, state)": "qpos must be positions, got a state: give its .qpos",
-    "mg.render.write_video(np.zeros((2, 4, 4, 3), np.uint8), 'v.mp4')": "path must be the path of a file, got ndarray",
+    "mg.render.write_video(np.zeros((2, 4, 4, 3), np.uint8), 'v.mp4')": "a file, got an array of shape (2, 4, 4, 3)",
     "mg.render.write_video('v.mp4', np.zeros((2, 4, 4, 5), np.uint8))": "video must have shape (frames, height, width, 3), got",
     "mg.rollout(scene, eqx.tree_at(lambda s: s.time, state, jnp.zeros(3)), u)": "state.time must have shape () in this",
     "mg.rollout(scene, eqx.tree_at(lambda s: s.qpos, state, None), u)": "state.qpos must be real numbers, got NoneType",
@@ -617,6 +636,21 @@ FOUND = {
     "mg.learning.evaluate(Rewarded(limited), lambda obs: np.sin(np.asarray(obs)), key, num_episodes=2)":
         "the policy must compute with jax.numpy",
     "(env := Rewarded(limited, seen=[1, 2])).step(env.reset(key), [0.0])": "no error",
+    "type('Env', (Rewarded,), {'start': lambda *_: jnp.zeros(3)})(scene).reset(key)":
+        "what start of Env returns must be of mg.initial_state, got an array of shape (3,)",
+    "type('Env', (Rewarded,), {'start': lambda *_: np.zeros(3)})(scene).reset(key)": "must be of mg.initial_state, got an array",
+    "type('Env', (Rewarded,), {'rewards': lambda env, before, *_: before.qpos[0]})(scene).reset(key)":
+        "what rewards of Env returns must be a dict of numbers by name, such as {\"speed\": ...}, got an array of shape ()",
+    "(env := type('Env', (Rewarded,), {'disturbed': lambda env, state, _: state.qpos})(limited)).step(env.reset(key), [0.0])":
+        "what disturbed of Env returns must be a state, as it was given, got an array of shape (1,)",
+    "jax.jit(lambda key: cart.reset(key))(1.0)": "key must be one of jax.random.key, got an array of shape ()",
+    "Rewarded(scene, contact='discrete')": 'mg.Onset() or mg.Smoothing(), got "discrete"',
+    "envs.diffrl.CartPole(scene, contact=mg.Slope)": "mg.Onset() or mg.Smoothing(), got <class 'mjxgrad",
+    "Rewarded(scene, contact=mg.Smoothing([1e-3, 2e-3])).refined(2)": "no error",  # for jax.vmap
+    "gym.GymEnv(3)": "environment must be of mg.envs.Environment, or the name of one, got int",
+    "gym.GymVectorEnv(cart, num_envs=2.5)": "num_envs must be a whole number, got 2.5",
+    "gym.GymEnv(cart, render_mod='rgb_array')": "an option must be one of 'render_mode', 'height', 'width', 'camera', got 'ren",
+    "(env := gym.GymEnv(cart), env.reset(), env.step('left'))": "action must be real numbers, got str",
     # What plans are made of.
     "planning.optimise_trajectory(system, Leaving(), jnp.zeros(3), np.eye(2), key, smoother=planning.Exact(), schedule=[1])":
         "start must have shape (2,) in this system, got (3,)",
@@ -638,6 +672,12 @@ FOUND = {
     "type('Cost', (Leaving,), {'stage': lambda *_: None})().total(system, jnp.zeros((2, 2)), jnp.zeros((1, 2)))":
         "stage of a cost must return one number, got NoneType",
     "type('Cost', (Leaving,), {'stage': lambda *_: 0})().total(system, jnp.zeros((2, 2)), jnp.zeros((1, 2)))": "no error",
+    "squares(stages=lambda x: x[0])": "residuals of Squares must return a vector, got shape ()",
+    "squares(ends=lambda x: x[None])": "terminal_residuals of Squares must return a vector, got shape (1, 2)",
+    "squares(stages=lambda x: None)": "residuals of Squares must be real numbers, got NoneType",
+    "Squares(ends=lambda x: 1.0).total(system, jnp.zeros((2, 2)), jnp.zeros((1, 2)))": "must return a vector, got shape ()",
+    "squares(stages=lambda x: [x[0], 1])": "no error",
+    "planning.SceneSystem(scene, contact='slope')": 'mg.Onset() or mg.Smoothing(), got "slope"',
     "planning.GoalCost('up', 1.0, 1.0, 0.1)": "goal must be real numbers, got str",
     "planning.GoalCost(jnp.full(2, jnp.nan), 1.0, 1.0, 0.1)": "goal must be finite, got [nan nan]",
     "planning.GoalCost(jnp.zeros(2), jnp.inf, 1.0, 0.1)": "stage_weight must be at least 0 and finite, got inf",

@@ -336,7 +336,9 @@ def sweep(
     log: Callable[[str], None] | None = None,
     progress: bool = True,
     engine: EngineName | None = None,
-    **task_settings: Any,
+    start: str | int | None = None,
+    horizon: int | None = None,
+    contact: Contact | None = None,
 ) -> Sweep:
     """Measure bias and variance of first, zeroth and α-order gradients over contact stiffness, in a scene of one's own.
 
@@ -354,10 +356,10 @@ def sweep(
         log: called with the name of each part as it starts. Ctrl-C ends with the stiffnesses measured so far.
         engine: who steps, see `Scene.with_engine`; by default a scene's own, and of a file on a CPU C MuJoCo, which compiles
             nothing.
-        **task_settings: `start`, a key frame with its controls, by default the first, else the reference pose, at rest;
-            `horizon`, a number of time steps, by default half a second, but 50 to 300; `contact`, see `rollout`, by default
-            `mg.Slope()`, or `mg.Discrete()` where slopes scatter so much that it errs less than half as much at the file's
-            own contact.
+        start: a key frame with its controls, by default the first, else the reference pose, at rest.
+        horizon: number of time steps, by default half a second, but 50 to 300.
+        contact: how contact is stepped, see `rollout`; by default `mg.Slope()`, or `mg.Discrete()` where this errs less than half
+            as much at the file's own contact, for slopes scatter there.
 
     Raises:
         ValueError: if there is no such file, function, body or key frame, a number is out of range, or nothing that the controls
@@ -374,15 +376,16 @@ def sweep(
     function("log", log, "text")
     instance("progress", progress, bool, "True or False")
     say, began, last = log or (paced("sweep") if progress else lambda _: None), [], [0]
-    is_own = isinstance(task_settings.get("contact"), Slope | Discrete | None)
+    is_own = isinstance(contact, Slope | Discrete | None)
     quick = QUICK if is_own and device.is_cpu() else None
     scene = source if isinstance(source, Scene) else load_scene(source, engine=engine or quick)
     scene = scene if engine is None else scene.with_engine(engine)
-    if task_settings.get("start") is None and scene.mj_model.nkey:
-        task_settings["start"] = scene.mj_model.key(0).name or 0
-    is_free = task_settings.get("contact") is None
-    task_settings = {k: x for k, x in task_settings.items() if k != "contact" or not is_free}
-    task = scene_task(scene, cost, seed=seed, **task_settings)
+    if start is None and scene.mj_model.nkey:
+        start = scene.mj_model.key(0).name or 0
+    is_free = contact is None
+    task = scene_task(
+        scene, cost, start=start, horizon=horizon, contact=Slope() if contact is None else contact, seed=seed
+    )
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")

@@ -22,7 +22,7 @@ from mjxgrad.objective.base import as_scalar
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Discrete
+from mjxgrad.stepping import Contact, Discrete, check_contact
 
 _DIVERGED = "diverged"  # in the metrics, beside the terms of the reward
 Rewards = dict[str, Float[Array, ""]]
@@ -91,6 +91,8 @@ class Environment(InScene):
         for name in ("frame_skip", "episode_length"):
             whole(name, getattr(self, name))
         function("randomisation", self.randomisation, "key", "scene")
+        if not isinstance(self.contact, Contact):  # lengths with a leading axis may be for jax.vmap
+            check_contact(self.contact)
 
     @abstractmethod
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:
@@ -169,7 +171,7 @@ class Environment(InScene):
         start_key, memory_key, next_key = jax.random.split(key, 3)
         physics, memory = self.start(start_key), self.first_memory(memory_key)
         name = type(self).__name__
-        instance(f"start of {name}", physics, State, "of mg.initial_state")
+        instance(f"what start of {name} returns", physics, State, "of mg.initial_state")
         physics = self.completed(physics)
         obs = self._vector("observe", self.observe(physics, memory))
         action = jnp.zeros(self.num_actions, obs.dtype)
@@ -191,7 +193,7 @@ class Environment(InScene):
     def _terms(self, before: State, action: Array, after: State, memory: PyTree, dtype: Any) -> Rewards:
         """Return the terms of the reward as floats."""
         terms, name = self.rewards(before, action, after, memory), f"rewards of {type(self).__name__}"
-        instance(name, terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
+        instance(f"what {name} returns", terms, dict, 'a dict of numbers by name, such as {"speed": ...}')
         if not terms or not all(isinstance(term, str) for term in terms) or {"reward", _DIVERGED} & terms.keys():
             wanted = "must name at least one number, by text other than 'reward' and 'diverged'"
             raise ValueError(f"{name} {wanted}, got {list(terms)}")
@@ -218,7 +220,9 @@ class Environment(InScene):
         key, memory_key = jax.random.split(state.key)
         control = self._vector("control", self.control(action), self.num_actions)
         controls = jnp.broadcast_to(control, (self.frame_skip, self.num_actions))
-        course = rollout(self.scene, self.disturbed(state.physics, state.memory), controls, contact=self.contact)
+        physics = self.disturbed(state.physics, state.memory)
+        instance(f"what disturbed of {name} returns", physics, State, "a state, as it was given")
+        course = rollout(self.scene, physics, controls, contact=self.contact)
         after = course.final
         terms = self._terms(state.physics, action, after, state.memory, dtype)
         memory = self.next_memory(state.memory, action, after, memory_key)

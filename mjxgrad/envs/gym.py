@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from mjxgrad._arrays import instance, one_of, real, whole
 from mjxgrad.envs import ENVIRONMENTS, load
 from mjxgrad.envs.environment import Environment, EnvState
 from mjxgrad.rollouts import render
@@ -24,6 +25,7 @@ from gymnasium.vector.utils import batch_space
 
 _Info = dict[str, Any]
 _Named = Environment | str
+_VIEW = ("height", "width", "camera")
 
 
 class _Adapter:
@@ -33,6 +35,9 @@ class _Adapter:
 
     def _prepare(self, environment: _Named, render_mode: str | None, view: _Info) -> None:
         self.environment = load(environment) if isinstance(environment, str) else environment
+        instance("environment", self.environment, Environment, "of mg.envs.Environment, or the name of one")
+        for name in view:
+            one_of("an option", name, ("render_mode", *_VIEW))
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f'render_mode must be "rgb_array" or None, got {render_mode!r}')
         self.render_mode, self._view, self._state = render_mode, view, None
@@ -45,14 +50,16 @@ class _Adapter:
 
     def _given(self, action: np.ndarray) -> tuple[Array, EnvState, Array]:
         """Return the copies' keys, their states and an action, of which all numbers are finite."""
-        if not np.isfinite(action := np.asarray(action)).all():
+        state, action, shape = self._begun("step"), np.asarray(real("action", action)), self.action_space.shape
+        if action.shape != shape:
+            raise ValueError(f"action must have shape {shape}, got {action.shape}")
+        if not np.isfinite(action).all():
             raise ValueError(f"action must be finite, got {np.count_nonzero(~np.isfinite(action))} that are not")
-        return self._copy_key, self._begun, jnp.asarray(action)
+        return self._copy_key, state, jnp.asarray(action)
 
-    @property
-    def _begun(self) -> EnvState:
+    def _begun(self, method: str) -> EnvState:
         if self._state is None:
-            raise gymnasium.error.ResetNeeded("reset must be called first")
+            raise gymnasium.error.ResetNeeded(f"Cannot call env.{method}() before calling env.reset()")
         return self._state
 
     def _spaces(self) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -76,7 +83,7 @@ class GymEnv(_Adapter, gymnasium.Env):
         the scene's first camera, if any.
 
         Raises:
-            ValueError: if there is no such environment or render mode.
+            ValueError: if there is no such environment, option or render mode.
         """
         self._prepare(environment, render_mode, view)
         self.observation_space, self.action_space = self._spaces()
@@ -90,7 +97,7 @@ class GymEnv(_Adapter, gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """Draw the present state, in the render mode "rgb_array"."""
-        return None if self.render_mode is None else self._drawn(self._begun.physics.qpos[None])[0]
+        return None if self.render_mode is None else self._drawn(self._begun("render").physics.qpos[None])[0]
 
     def _info(self, state: EnvState) -> _Info:
         return {name: float(value) for name, value in state.metrics.items()}
@@ -106,7 +113,7 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
     def __init__(self, environment: _Named, num_envs: int = 1, *, render_mode: str | None = None, **view: Any):
         """Prepare `num_envs` copies; the other arguments, and errors, are those of `GymEnv`."""
         self._prepare(environment, render_mode, view)
-        self.num_envs = num_envs
+        self.num_envs = num_envs = whole("num_envs", num_envs)
         self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
         self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -124,7 +131,7 @@ class GymVectorEnv(_Adapter, gymnasium.vector.VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw the present state of each copy, in the render mode "rgb_array"."""
-        return None if self.render_mode is None else tuple(self._drawn(self._begun.physics.qpos))
+        return None if self.render_mode is None else tuple(self._drawn(self._begun("render").physics.qpos))
 
     def _info(self, state: EnvState) -> _Info:
         """Return the metrics in gymnasium's layout: arrays, each with a mask of the copies that have it."""

@@ -14,13 +14,13 @@ References:
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from mjxgrad.identification.normal import Step, at, solved, split
+from mjxgrad.identification.normal import Step, at, distinct, solved, split
 from mjxgrad.rollouts import DivergedError
 
 # Root mean square of residuals over their covariance, at which chatter that is not normal still explains them.
@@ -37,6 +37,7 @@ _SHORT, _SETTLED = 0.7, 1.5  # at the end: step of each number in widths; ratio 
 _SURE = 0.003  # width of a coordinate: where all but noise is explained, narrower intervals are not worth the time
 # Ensembles at least, and those at the end of which the mean is the answer: each has its scatter.
 _FEWEST, _AVERAGED = 3, 3
+_BY_CHANCE = 3.0  # standard deviations of what errors of a derivative have for squares, beyond which it is no error
 _HALF_WIDTH = 1.96  # of an interval that holds at 95 %, in standard errors
 
 Box = tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]
@@ -55,6 +56,7 @@ class Ensemble(NamedTuple):
     is_settled: bool
 
 
+_Product = Callable[[np.ndarray], np.ndarray]
 Say = Callable[[Ensemble, float, int, float], None]
 """Function of the best ensemble so far, and of the last one's sum of squares, motions, and motions ahead, about."""
 
@@ -90,22 +92,15 @@ def fit(
     """
     rng, dim, lowest, wide = np.random.default_rng(0), len(point[0]), np.inf, np.inf
     free = widths[1].shape[1]
-    own, along = widths[1][:, :, None] * np.eye(free), np.zeros((*point[1].shape, dim))
-    law = _Law(*point, np.diag(widths[0]), own, along)
+    law = _first(point, widths)
     num = fewest = size(dim + free)
     most = count * noise**2 * (1.0 + _EXCESS * np.sqrt(2.0 / count))
     ends: list[_Law] = []
     index, spent, best = 0, 0, None
     while True:
         index, spent, used = index + 1, spent + num, num
-        drawn, starts = law.draw(num, rng, box)
-        residuals = motions(drawn, starts)
-        is_finite = np.isfinite(residuals).all(axis=(1, 2))
-        drawn, starts = drawn[is_finite], starts[is_finite]
-        if len(drawn) < 2 * (dim + free) + 2:
-            raise DivergedError("most motions must stay finite about the best values, got few: give narrower bounds")
+        model, drawn, starts = _regression(motions, *law.draw(num, rng, box))
         middle, centres = drawn.mean(axis=0), starts.mean(axis=0)
-        model = Regression(drawn, starts, residuals[is_finite])
         factors, chatter, step = _explained(model, noise, (box[0] - middle, box[1] - middle), dim, most)
         length = float(np.linalg.norm(np.linalg.lstsq(law.root, step.values, rcond=None)[0]))
         change = step.values * min(1.0, _LONGEST / max(length, 1e-300))
@@ -117,6 +112,11 @@ def fit(
         num = min(2 * num, _MORE * fewest) if is_worse else num  # few motions lack directions of chatter
         growth = float(np.sqrt(max(misfit / (count * noise**2), 1.0))) * noise
         before, kept = law, (_WIDER if has_missed else _NARROWER) * law.root
+        *_, slope, _ = split(factors, dim)
+        # What cannot be told keeps its width: among motions that hardly differ it never could be.
+        if not has_missed:
+            narrowed = law.root - kept
+            kept = kept + narrowed - np.linalg.pinv(slope, rcond=1e-9) @ (slope @ narrowed)
         law = _law(factors, middle + change, centres + moved, growth, kept, change)
         is_narrow = bool((before.variances < _SETTLED**2 * law.variances).all())
         # Where all but noise is explained, more ensembles would only narrow the intervals.
@@ -139,6 +139,35 @@ def fit(
         say(best, misfit, used, 0.0 if is_last else float(min(ahead, (_MOST - index + 1) * num)))
         if is_last:
             return best
+
+
+def outlook(
+    motions: Motions,
+    point: tuple[np.ndarray, np.ndarray],
+    widths: tuple[np.ndarray, np.ndarray],
+    box: Box,
+    noise: float,
+) -> Float[np.ndarray, "windows columns columns"]:
+    """Return the factors of a first ensemble, of the arguments of `fit`: what the mean of motions tells of a point."""
+    law = _first(point, widths)
+    drawn = law.draw(size(len(point[0]) + widths[1].shape[1]), np.random.default_rng(0), box)
+    return _regression(motions, *drawn)[0].weighed(noise)
+
+
+def _first(point: tuple[np.ndarray, np.ndarray], widths: tuple[np.ndarray, np.ndarray]) -> "_Law":
+    """Return the law of the first motions, whose values and starts are independent."""
+    own = widths[1][:, :, None] * np.eye(widths[1].shape[1])
+    return _Law(*point, np.diag(widths[0]), own, np.zeros((*point[1].shape, len(point[0]))))
+
+
+def _regression(motions: Motions, drawn: np.ndarray, starts: np.ndarray) -> tuple["Regression", np.ndarray, np.ndarray]:
+    """Return the regression of motions, and the values and starts of those that stay finite."""
+    residuals = motions(drawn, starts)
+    is_finite = np.isfinite(residuals).all(axis=(1, 2))
+    drawn, starts = drawn[is_finite], starts[is_finite]
+    if len(drawn) < 2 * (drawn.shape[1] + starts.shape[2]) + 2:
+        raise DivergedError("most motions must stay finite about the best values, got few: give narrower bounds")
+    return Regression(drawn, starts, residuals[is_finite]), drawn, starts
 
 
 class _Law(NamedTuple):
@@ -202,42 +231,82 @@ def _mean_of(ends: list[_Law], factors: np.ndarray, misfit: float, drawn: np.nda
     return Ensemble(values, starts, factors, misfit, drawn, len(ends) == _AVERAGED)
 
 
+class _Part(NamedTuple):
+    """The regression of a window: columns by starts and values with the mean, what is left, and its products."""
+
+    columns: Float[np.ndarray, "columns numbers"]
+    left: Float[np.ndarray, "motions numbers"]
+    gram: Float[np.ndarray, "motions motions"]
+    inverse: Float[np.ndarray, "columns columns"]  # of the products of what was drawn: errors of columns go by it
+
+
 class Regression:
-    """The mean residual of each window and its derivatives, and the chatter that is left."""
+    """The mean residual of each window and its derivatives, and the chatter that is left.
+
+    The derivatives have errors of chatter, too, by which alone two numbers of one effect would be told apart: see `distinct`.
+    """
 
     def __init__(
         self, drawn: Float[np.ndarray, "motions dim"], free: Float[np.ndarray, "motions windows free"],
         residuals: Float[np.ndarray, "motions windows numbers"],
     ):  # fmt: skip
         self._middle, self._count, self._width = drawn.mean(axis=0), len(drawn), 1 + drawn.shape[1] + free.shape[2]
-        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        self._parts: list[_Part] = []
         for starts, one in zip(free.swapaxes(0, 1), residuals.swapaxes(0, 1), strict=True):
             away = np.column_stack([starts - starts.mean(axis=0), drawn - self._middle, np.ones(self._count)])
-            columns = np.linalg.pinv(away) @ one
+            inverse = np.linalg.pinv(away)
+            columns = inverse @ one
             left = one - away @ columns
-            self._parts.append((columns, left, left @ left.T))
+            self._parts.append(_Part(columns, left, left @ left.T, inverse @ inverse.T))
 
-    def _weighed(self, noise: float, chatter: float) -> Iterator[Callable[[np.ndarray], np.ndarray]]:
-        """Yield, by window, the product of all columns with others, weighed by the covariance of noise and chatter."""
-        scale = max(self._count - self._width, 1) * noise**2 / chatter
-        for columns, left, gram in self._parts:
+    def _weighed(self, noise: float, chatter: float) -> tuple[np.ndarray, list[_Product]]:
+        """Return what tells derivatives apart, and by window the product of all columns with others.
+
+        Products are weighed by the covariance of noise and chatter, the latter by a factor.
+        """
+        scale, dim = max(self._count - self._width, 1) * noise**2 / chatter, len(self._middle)
+        slope, error, found = np.zeros((dim, dim)), np.zeros((dim, dim)), list[_Product]()
+        for columns, left, gram, inverse in self._parts:
             # (σ² + e e'/n)⁻¹ = (1 - e (n σ² + e'e)⁻¹ e') / σ², in the space of motions, which are fewer than numbers.
-            kept = np.linalg.solve(max(scale, 1e-12 * np.trace(gram)) * np.eye(self._count) + gram, left @ columns.T)
-            yield lambda others, columns=columns, left=left, kept=kept: columns @ others - kept.T @ (left @ others)
+            least = max(scale, 1e-12 * np.trace(gram))
+            within = least * np.eye(self._count) + gram
+            kept, across = np.linalg.solve(within, left @ columns.T), np.linalg.inv(within)
+            product = columns @ columns.T - kept.T @ (left @ columns.T)
+            free = len(columns) - dim - 1
+            # What the starts explain tells nothing of the values; by these shares of theirs, errors of starts count, too.
+            shares = -np.linalg.pinv(product[:free, :free], hermitian=True) @ product[:free, free:-1]
+            shares = np.vstack([shares, np.eye(dim)])
+            slope += shares.T @ product[:-1, :-1] @ shares
+            # e_i' (n σ² + e'e - e_i e_i')⁻¹ e_i: each motion's chatter over the covariance of noise and that of the others, as
+            # that of the columns' errors is another one than what is left.
+            alone = 1.0 / np.maximum(least * np.diag(across), 1e-12) - 1.0
+            # Squares of as many errors as chatter has directions are rarely more than what is expected of them and this more.
+            part = np.eye(self._count) - least * across
+            spread = np.sqrt(2.0 * np.sum(part**2) / max(np.trace(part) ** 2, 1e-300))
+            most = noise**2 / chatter * alone.sum() * (1.0 + _BY_CHANCE * spread)
+            error += most * shares.T @ inverse[:-1, :-1] @ shares
+            found.append(
+                lambda others, columns=columns, left=left, kept=kept: columns @ others - kept.T @ (left @ others)
+            )
+        return distinct(slope, error), found
 
     def weighed(self, noise: float, chatter: float = 1.0) -> Float[np.ndarray, "windows columns columns"]:
         """Return factors of mean residual and derivatives over the root of the covariance, times the noise.
 
         The covariance is that of noise and chatter, the latter by a factor.
         """
+        apart, products = self._weighed(noise, chatter)
         found = []
-        for (columns, *_), product in zip(self._parts, self._weighed(noise, chatter), strict=True):
+        for (columns, *_), product in zip(self._parts, products, strict=True):
             gram = product(columns.T)
             sizes = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
             values, axes = np.linalg.eigh(gram / np.outer(sizes, sizes))
             root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T * sizes
             found.append(np.linalg.qr(root, mode="r"))
-        return np.stack(found)
+        factors = np.stack(found)
+        by_value = slice(-1 - len(apart), -1)
+        factors[..., by_value] = factors[..., by_value] @ apart
+        return factors
 
     def errors(
         self, drawn: Float[np.ndarray, "motions dim"], residuals: Float[np.ndarray, "motions windows numbers"],
@@ -246,14 +315,15 @@ class Regression:
         """Return errors of the values that other motions would be given if they were recorded, in standard errors."""
         rng, dim = np.random.default_rng(1), drawn.shape[1]
         slope, seen = np.zeros((dim, dim)), np.zeros((dim, len(drawn)))
-        for (columns, *_), product, one in zip(
-            self._parts, self._weighed(noise, chatter), residuals.swapaxes(0, 1), strict=True
-        ):
+        apart, products = self._weighed(noise, chatter)
+        for (columns, *_), product, one in zip(self._parts, products, residuals.swapaxes(0, 1), strict=True):
             free = len(columns) - dim - 1
             gram, told = product(columns.T), product((one + noise * rng.normal(size=one.shape) - columns[-1]).T)
             inner = gram[:-1, :free] @ np.linalg.pinv(gram[:free, :free], hermitian=True)
             slope += gram[free:-1, free:-1] - inner[free:] @ gram[:free, free:-1]
             seen += told[free:-1] - inner[free:] @ told[:free]
-        inverse = np.linalg.pinv(slope, rcond=1e-12, hermitian=True)
-        sizes = np.sqrt(np.diag(inverse))
-        return ((inverse @ seen).T - (drawn - self._middle)) / np.where(sizes > 0, noise * sizes, np.inf)
+        inverse = np.linalg.pinv(apart.T @ slope @ apart, rcond=1e-12, hermitian=True)
+        # A number that cannot be told has no error.
+        is_told = (apart == np.eye(dim)).all(axis=1)
+        sizes = np.sqrt(np.where(is_told, np.diag(inverse), 0.0))
+        return ((inverse @ apart.T @ seen).T - (drawn - self._middle)) / np.where(sizes > 0, noise * sizes, np.inf)

@@ -6,8 +6,11 @@ The factors of a window are the triangle of a QR decomposition of its derivative
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from jaxtyping import Float
+
+_FAINT = 1e-14  # of a column, squared: what is less is rounding
 
 
 class Step(NamedTuple):
@@ -67,6 +70,55 @@ def solved(
         values[is_free] = scipy.optimize.lsq_linear(scaled[:, is_free], -residual, bounds).x / lengths[is_free]
     starts, squares = at(factors, values)
     return Step(values, starts, float(np.sum((slope @ values) ** 2)), squares)
+
+
+def distinct(gram: Float[np.ndarray, "dim dim"], error: Float[np.ndarray, "dim dim"]) -> Float[np.ndarray, "dim dim"]:
+    """Return what columns are to be multiplied with, so that what tells them apart by their own errors alone is gone.
+
+    Columns are differences of motions, whose widths and jumps err. Two columns of one effect differ by these errors, which no
+    regression tells from a small effect of a difference: as a rule they promise values of both where there is one of the sum.
+    Directions in which columns have no more effect than errors can have are therefore taken to have none. A single number stays
+    as it is, for its size errs and not what it is told from.
+
+    Args:
+        gram: products of the columns.
+        error: products that their errors have at most.
+    """
+    lengths = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    is_felt = np.flatnonzero(lengths > 1e-12 * lengths.max(initial=0.0))
+    found, lengths = np.eye(len(gram)), lengths[is_felt]
+    if len(is_felt) < 2:
+        return found
+    block, across = np.ix_(is_felt, is_felt), np.outer(lengths, lengths)
+    effect, doubt = gram[block] / across, error[block] / across + _FAINT * np.eye(len(is_felt))
+    ratios, vectors = scipy.linalg.eigh(effect, doubt)
+    kept = []
+    for row in simple(vectors[:, ratios <= 1.0].T):
+        # Shares of further numbers are errors, too, unless the direction has an effect without them.
+        parts, least = np.flatnonzero(row), row[row != 0]
+        for i in np.argsort(np.abs(row))[:-1]:
+            fewer = parts[parts != i]
+            ratio, those = scipy.linalg.eigh(effect[np.ix_(fewer, fewer)], doubt[np.ix_(fewer, fewer)])
+            if ratio[0] <= 1.0:
+                parts, least = fewer, those[:, 0]
+        if len(parts) > 1:
+            one = np.zeros_like(row)
+            one[parts] = least / np.linalg.norm(least)
+            kept.append(one)
+    if kept:
+        # As in a regression on the others alone: their errors do not take part in those of what is gone.
+        lost = np.array(kept)
+        gone = lost.T @ np.linalg.pinv(lost @ doubt @ lost.T, hermitian=True) @ lost @ doubt
+        found[block] -= gone * lengths / lengths[:, None]
+    return found
+
+
+def simple(rows: Float[np.ndarray, "rows dim"]) -> Float[np.ndarray, "rows dim"]:
+    """Return rows that span the same, in each of which a number is that is in no other."""
+    if not len(rows):
+        return rows
+    *_, order = scipy.linalg.qr(rows, mode="economic", pivoting=True)
+    return np.linalg.solve(rows[:, order[: len(rows)]], rows)
 
 
 def at(factors: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:

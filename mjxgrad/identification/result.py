@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 from jaxtyping import Float
 
 from mjxgrad._text import Printed, aligned, duration, format_number, write
 from mjxgrad.identification.ensemble import MISFIT
+from mjxgrad.identification.normal import simple
 from mjxgrad.identification.parameters import Coordinates
 from mjxgrad.scene import Scene
 
@@ -61,7 +61,9 @@ class Outlook(Printed):
         num_motions: motions of all windows that it takes, about.
         num_windows: windows, each of `num_steps` steps.
         num_steps: steps of a window.
-        is_rugged: whether contacts chatter already at the nominal values: then the intervals will be wider by far.
+        is_rugged: whether contacts chatter already at the nominal values.
+        is_mean: whether the intervals are those of the mean of many motions, which allow for chatter; without, where most of
+            such motions diverge, they will be wider by far.
     """
 
     coordinates: Coordinates
@@ -72,6 +74,7 @@ class Outlook(Printed):
     num_windows: int
     num_steps: int
     is_rugged: bool = False
+    is_mean: bool = False
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return a table of text, header first: name, standard error that the recordings allow, and what it goes with."""
@@ -96,9 +99,12 @@ class Outlook(Printed):
             if lost
             else "Every number is told, at the first values:"
         )
-        if self.is_rugged:
+        if self.is_rugged and self.is_mean:
+            told += " Contacts chatter; errors are those of the mean of many motions there, and will change with the values:"
+        elif self.is_rugged:
             told += " Contacts chatter, so that the errors will be larger than these by far:"
-        return "\n".join([price, told, *(f"  {line}" for line in aligned(self.rows()))])
+        apart = [_without_effect(one) for one in self.told["inseparable"]]
+        return "\n".join([price, told, *(f"  {line}" for line in aligned(self.rows())), *apart])
 
     __str__ = summary
 
@@ -278,8 +284,7 @@ class Identification(Printed):
         if self.without_effect and self.is_measured:
             found.append(f"Without effect on anything measured: {', '.join(self.without_effect)}. Leave them out.")
         for combination in self.inseparable:
-            changes = " with ".join(f"{100 * share:+.2g} % of {name}" for name, share in combination.items())
-            found.append(f"Cannot be told apart: {', '.join(combination)}. {changes} changes nothing measured.")
+            found.append(f"Cannot be told apart: {', '.join(combination)}. {_without_effect(combination)}")
         if names := ", ".join(self.at_bounds):
             found.append(f"At a bound: {names}. The data ask for more; widen it or doubt the model.")
         return found
@@ -345,16 +350,18 @@ def exceeds_noise(rms: float, freedom: int, chance: float = CHANCE) -> bool:
 
 def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) -> tuple[dict[str, float], ...]:
     """Return directions without effect as relative changes of few numbers, the first by one per cent."""
-    if not len(blurred):
-        return ()
     relative = blurred / np.where(values != 0, values, 1.0)
-    *_, order = scipy.linalg.qr(relative, mode="economic", pivoting=True)
-    relative = np.linalg.solve(relative[:, order[: len(blurred)]], relative)
     found = []
-    for row in relative:
+    for row in simple(relative):
         parts = np.flatnonzero(np.abs(row) > _SMALL_PART * np.abs(row).max())
         found.append({str(names[i]): float(0.01 * row[i] / row[parts[0]]) for i in parts})
     return tuple(found)
+
+
+def _without_effect(combination: dict[str, float]) -> str:
+    """Say what change of numbers together has no effect, so that only what it leaves is told."""
+    changes = " with ".join(f"{100 * share:+.2g} % of {name}" for name, share in combination.items())
+    return f"{changes} changes nothing measured."
 
 
 def _partners(told: dict[str, Any], coordinates: Coordinates) -> list[str]:

@@ -20,9 +20,10 @@ from jaxtyping import Float
 from mjxgrad._arrays import function, instance, whole
 from mjxgrad._text import duration, paced
 from mjxgrad.identification.ensemble import EXPECTED, MISFIT, Ensemble, algebra, fit
+from mjxgrad.identification.ensemble import outlook as ensemble_outlook
 from mjxgrad.identification.ensemble import size as ensemble_size
 from mjxgrad.identification.motions import AT_ONCE, Motions
-from mjxgrad.identification.normal import factors_of, solved, split
+from mjxgrad.identification.normal import distinct, factors_of, solved, split
 from mjxgrad.identification.parameters import Parameter, check_entries
 from mjxgrad.identification.recording import Recording, Windows, after_start, doubts, spread, stack
 from mjxgrad.identification.result import Identification, Outlook, Stopped, exceeds_noise, statistics
@@ -42,6 +43,7 @@ _ENOUGH, _CLOSE = (
 _LONGEST = 1.0  # step in a coordinate at most
 _TRIALS = (12, 40)  # steps tried at an early horizon and at the last
 _NUM_AWAY, _AWAY, _RUGGED = 12, 2.0, 0.2  # motions and their standard errors away; share of changes that is not linear
+_DOUBT = 2.0  # times the difference to secants of half the width, which is 3/4 of an error, or more if motions jump
 _EXACT = 1e-6  # of the first residuals: nothing is left
 _LEFT = 0.3  # of the first residuals, above which better values are sought where the noise is not known
 _SCATTERED, _BEST = 512, 3  # motions between the bounds, and those from which descents begin anew
@@ -69,6 +71,7 @@ class _End(NamedTuple):
     factors: Float[np.ndarray, "windows rows columns"]
     squares: float
     residual: Float[np.ndarray, "windows numbers"] | None  # of a single motion
+    linear: "_Linear | None" = None  # the derivative that gave the factors
     many: Ensemble | None = None
     stopped: Stopped = Stopped.CONVERGED
 
@@ -159,7 +162,8 @@ def outlook(
 ) -> Outlook:
     """Return what recordings can tell of parameters, and what a search would take, before `identify` with these arguments.
 
-    The relative errors are those of a linear model at the nominal values, if the noise is as stated and contacts do not chatter.
+    The relative errors are those of a linear model at the nominal values, if the noise is as stated. Where contacts chatter, it
+    is that of the mean of 192 motions or more, as `identify` fits it; errors there can be several times larger or smaller.
 
     Raises:
         ValueError: as `identify`.
@@ -169,14 +173,22 @@ def outlook(
     problem, start = search.problem, search.end
     residual = problem.residuals([start.point], problem.num_steps)[0]
     widths = np.full(problem.count, _FIRST), np.full(problem.sizes.shape[1], 0.3)
-    linear = search.linear(start.point, residual, widths, problem.num_steps, 1.0)
-    factors = factors_of(residual, linear.slope, linear.by_start)
+    # Half a standard error is the next width.
+    half = _NARROW / max(float(np.linalg.norm(residual)), 1e-300)
+    linear = search.linear(start.point, residual, widths, problem.num_steps, half)
     num, more = search.price(is_rugged := search.is_rugged(linear, start.point, 1.0))
-    coordinates = problem.motions.coordinates
+    coordinates, factors = problem.motions.coordinates, None
+    if is_rugged:  # jumps tell single secants apart, and much better than motions tell numbers
+        with contextlib.suppress(DivergedError):
+            factors = search.mean(start.point)
+    if not (is_mean := factors is not None):
+        narrow = tuple(np.minimum(one, other) for one, other in zip(widths, linear.widths, strict=True))
+        linear = search.linear(start.point, residual, narrow, problem.num_steps, 1.0)
+        factors = search.told(start.point, residual, linear)
     slope = _slope(problem, factors, coordinates.nominal)
     found = statistics(coordinates, coordinates.nominal, float(problem.num_numbers), slope, problem.num_numbers, 0)
     seconds = num * search.pace, more * search.pace
-    return Outlook(coordinates, found, *seconds, int(num), problem.windows.index.shape[0], problem.num_steps, is_rugged)
+    return Outlook(coordinates, found, *seconds, int(num), *problem.windows.controls.shape[:2], is_rugged, is_mean)
 
 
 def _checked(
@@ -363,7 +375,7 @@ class _Search:
         if best.factors is self._none and best.residual is not None and self.num_steps:
             first = np.full(self.problem.count, _FIRST), np.full(self.problem.sizes.shape[1], _FIRST)
             linear = self.linear(best.point, best.residual, first, steps, 1.0)
-            self.end = best._replace(factors=factors_of(best.residual, linear.slope, linear.by_start))
+            self.end = best._replace(factors=factors_of(best.residual, linear.slope, linear.by_start), linear=linear)
 
     def _descend(self, point: Point, noise: float | None) -> tuple[Stopped, bool]:
         """Minimise the residuals from a point over horizons that grow; return why it ended and whether the end is rugged."""
@@ -412,7 +424,7 @@ class _Search:
             near = linear.widths
             factors = factors_of(residual, linear.slope, linear.by_start)
             if is_whole:
-                here = _End(point, factors, total, residual)
+                here = _End(point, factors, total, residual, linear)
                 self._single, self.end = (here if total <= one.squares else one for one in (self._single, self.end))
             else:
                 self._early.append(point)
@@ -448,6 +460,27 @@ class _Search:
         windows = self.problem.windows
         is_in = (windows.index + windows.share <= steps)[..., None]
         return sum(int(((weight > 0) & is_in).sum()) for weight in windows.weight.values())
+
+    def told(self, point: Point, residual: np.ndarray, linear: "_Linear") -> np.ndarray:
+        """Return factors without what tells numbers apart by the errors of secants, which narrower ones show."""
+        problem, dim, factors = self.problem, self.problem.count, factors_of(residual, linear.slope, linear.by_start)
+        if dim < 2:
+            return factors
+        half = tuple(width / 2 for width in linear.used)
+        finer = self.linear(point, residual, half, problem.num_steps, 1.0)
+        apart = np.concatenate([linear.by_start - finer.by_start, linear.slope - finer.slope], axis=2)
+        both = factors_of(residual, np.concatenate([linear.slope, apart], axis=2), linear.by_start)
+        by_start, mixed, slope, _ = split(both, both.shape[2] - 1 - linear.by_start.shape[2])
+        # By the shares of starts that go with a value, their errors are in its derivative, too.
+        shares = -np.linalg.pinv(by_start, rcond=1e-6) @ mixed[..., :dim]
+        num = len(slope) // len(factors)
+        errors = slope[:, dim:].reshape(len(factors), num, -1)
+        errors = (errors[..., -dim:] + errors[..., :-dim] @ shares).reshape(-1, dim)
+        slope = slope[:, :dim]
+        factors[..., -1 - dim : -1] = factors[..., -1 - dim : -1] @ distinct(
+            slope.T @ slope, _DOUBT**2 * errors.T @ errors
+        )
+        return factors
 
     def linear(
         self, point: Point, residual: np.ndarray, widths: tuple[np.ndarray, np.ndarray], steps: int, share: float
@@ -487,7 +520,7 @@ class _Search:
             np.clip(share * size / np.where(one > 0, one, 1e-300), least, most)
             for size, one, most in zip(left_of, felt, widest, strict=True)
         )
-        return _Linear(slope, by_start, new)
+        return _Linear(slope, by_start, new, widths)
 
     def is_rugged(self, linear: "_Linear", point: Point, noise: float) -> bool:
         """Return whether motions some standard errors away are not where derivatives foretell."""
@@ -558,6 +591,17 @@ class _Search:
             beside = beside + _BESIDE * best.std(axis=0) * rng.normal(size=beside.shape)
             values = np.concatenate([best, np.clip(beside, low, high)])
 
+    def mean(self, point: Point) -> np.ndarray:
+        """Return the factors of the mean of many motions about a point, if the noise is as stated."""
+        problem, widths = self.problem, np.full(self.problem.count, _SPREAD)
+        own = np.full(problem.sizes.shape, _SPREAD if problem.free_start else 1.0)
+        box = problem.motions.coordinates.box()
+        return ensemble_outlook(self._whole, point, (widths, own), box, 1.0)
+
+    def _whole(self, values: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Return residuals of whole motions."""
+        return self.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], self.problem.num_steps)
+
     def _average(self, alone: _End, noise: float) -> None:
         """Fit the mean of many motions, from the end of a descent, and keep it unless that explains nothing more."""
         problem, before, began = self.problem, self.end, time.monotonic()
@@ -568,12 +612,9 @@ class _Search:
             self.num_steps, self._ahead = self.num_steps + 1, ahead * pace / self.pace
             if best.squares < before.squares:
                 stopped = Stopped.CONVERGED if best.is_settled else Stopped.STALLED
-                self.end = _End(Point(best.values, best.starts), best.factors, best.squares, None, best, stopped)
+                self.end = _End(Point(best.values, best.starts), best.factors, best.squares, None, None, best, stopped)
             self._later = self._after(noise)
             self._say(math.sqrt(squares / problem.num_numbers), motions=motions)
-
-        def run(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
-            return self.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], problem.num_steps)
 
         by_start, _, slope, _ = split(alone.factors, problem.count)
         excess = max(math.sqrt(alone.squares / problem.num_numbers), noise)
@@ -582,7 +623,7 @@ class _Search:
         own = own if problem.free_start else np.full(problem.sizes.shape, noise)
         box = problem.motions.coordinates.box()
         try:
-            fit(run, alone.point, (np.minimum(widths, _WIDEST), own), box, noise, problem.num_numbers, say)
+            fit(self._whole, alone.point, (np.minimum(widths, _WIDEST), own), box, noise, problem.num_numbers, say)
         except DivergedError:
             self.end = self.end._replace(stopped=Stopped.STALLED) if self.end is before else self.end
 
@@ -593,6 +634,7 @@ class _Linear(NamedTuple):
     slope: Float[np.ndarray, "windows numbers dim"]
     by_start: Float[np.ndarray, "windows numbers free"]
     widths: Any
+    used: tuple[np.ndarray, np.ndarray]  # widths of these secants
 
 
 def num_numbers(windows: Windows) -> int:
@@ -610,7 +652,10 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
     problem, end = search.problem, search.end
     coordinates, numbers = problem.motions.coordinates, problem.num_numbers
     values = coordinates.values(end.point.values)
-    slope = _slope(problem, end.factors, values)
+    factors = end.factors
+    if end.linear is not None and end.residual is not None and stopped is not Stopped.INTERRUPTED:
+        factors = search.told(end.point, end.residual, end.linear)
+    slope = _slope(problem, factors, values)
     verdict = statistics(coordinates, values, end.squares, slope, numbers, problem.sizes.size)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     signals = np.zeros((1, 2, 1)) if end.residual is None else end.residual.reshape(*problem.windows.index.shape, -1)

@@ -37,7 +37,8 @@ class RunOptions(eqx.Module):
         num_steps: largest number of steps.
         evaluate: cost of a point without noise, or any other measure of it; traceable. Its rollouts are not counted, and
             only the choice of the best parameters depends on it.
-        evaluate_every: steps between two evaluations. The last point is always evaluated.
+        evaluate_every: steps between two evaluations, for a cost that is dear beside an estimate: only evaluated points can be
+            the best. The last point is always evaluated.
         patience: steps in a row whose estimate is not finite, or whose samples feel nothing (`Reason.nothing_felt`), before
             the run gives up. If such steps do not move the parameters either, three in a row are enough.
         log: function called after every twentieth of the steps: `lambda step, metrics: wandb.log(dict(metrics), step=step)`.
@@ -49,7 +50,7 @@ class RunOptions(eqx.Module):
 
     num_steps: int = eqx.field(converter=functools.partial(whole, "num_steps"))
     evaluate: Callable[[Vector], Scalar] | None = None
-    evaluate_every: int = eqx.field(default=10, converter=functools.partial(whole, "evaluate_every"))
+    evaluate_every: int = eqx.field(default=1, converter=functools.partial(whole, "evaluate_every"))
     patience: int = eqx.field(default=10, converter=functools.partial(whole, "patience"))
     log: Log | None = None
     checkpoint: str | Path | None = None

@@ -64,7 +64,8 @@ def optimise(
         optimiser: an optimiser of optax; it also gets the mean cost under noise, as `value`.
         num_steps: largest number of steps.
         annealing: a schedule from step to scale, such as one of optax.
-        **options: `evaluate`, `evaluate_every`, `patience`, `log`, `checkpoint`, `progress`; see `RunOptions`.
+        **options: `evaluate`, a cost without noise, by which the best parameters are chosen, every `evaluate_every` steps (1);
+            `patience`, `log`, `checkpoint` and `progress`; see `mjxgrad.loop.descent.RunOptions`.
 
     Returns:
         The result; after Ctrl-C that of the steps done, `stopped` being `Stopped.interrupted`.

@@ -17,11 +17,12 @@ from jaxtyping import Array, ArrayLike, Float
 from mjxgrad._arrays import real, whole
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
-from mjxgrad.planning.linear_model import Exact, Smoother
+from mjxgrad.planning.linear_model import Analytic, Exact, Smoother
 from mjxgrad.planning.system import Cost, SceneSystem, System
 from mjxgrad.planning.trajectory import FREE, Course, Problem, deviations, posed, random_changes
 from mjxgrad.rollouts import State
 
+_SAMPLES = 16  # random changes of a plan, for 15 % of a decision's time where a finger pushes a box
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
 _RECENT, _QUANTILE = 20, 0.9  # a part is expected to take what so large a share of its last times stays below
 _SHARE = 0.25  # of a deadline that linear models may take between two looks at the clock
@@ -58,7 +59,7 @@ class Controller(Printed):
         smoother: Smoother = Exact(),
         schedule: Sequence[float] | Float[ArrayLike, " iterations"] = (1.0,),
         first_schedule: Sequence[float] | Float[ArrayLike, " first"] | None = None,
-        num_samples: int = 0,
+        num_samples: int | None = None,
         stddev: ArrayLike | None = None,
         deadline: float | None = None,
         lower: ArrayLike | None = None,
@@ -73,8 +74,10 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            num_samples: plans with random changes that are tried beside the step lengths, see `optimise_trajectory`. Where an
-                iteration is spread over decisions, they are tried in each that has the time, else in every other one.
+            num_samples: plans with random changes that are tried beside the step lengths, see `optimise_trajectory`: they find
+                what derivatives do not see, and get past where a push turns a body. None takes 16, none with a smoother such as
+                `Sampled`, whose steps are many. Where an iteration is spread over decisions, they are tried in each that has
+                the time, else in every other one.
             stddev: standard deviation of these changes.
             deadline: the time of a decision (s); one part of an iteration is taken at least. Where it is shorter than an
                 iteration more is compiled, to foretell from plans of two lengths what fits.
@@ -89,7 +92,8 @@ class Controller(Printed):
         """
         if deadline is not None and not real("deadline", deadline) > 0:
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
-        self.num_samples = whole("num_samples", num_samples, 0)
+        usual = _SAMPLES if isinstance(smoother, Analytic) else 0
+        self.num_samples = whole("num_samples", usual if num_samples is None else num_samples, 0)
         both = [schedule if first_schedule is None else first_schedule, schedule]
         given = system, cost, None, controls, jax.random.key(0), smoother, both, lower, upper
         problem, _, start, factors = posed(*given)
@@ -296,7 +300,8 @@ class Controller(Printed):
     def _untouched(self) -> str:
         places = np.flatnonzero(self._search.unmoved)
         told = f"no control moves {self.system.named(places)}, which has a cost: where nothing touches, derivatives are zero"
-        helps = "add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take num_samples=16"
+        more = f"num_samples={2 * self.num_samples or _SAMPLES}"
+        helps = f"add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take {more}"
         return f"{told}; {helps}"
 
     def __str__(self) -> str:

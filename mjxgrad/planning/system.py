@@ -8,6 +8,7 @@ import dataclasses
 import functools
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -145,6 +146,8 @@ class SceneSystem(System):
     def __check_init__(self):
         check_scene(self.scene)
         whole("num_substeps", self.num_substeps)
+        if not isinstance(self.contact, Contact):  # lengths with a leading axis may be for jax.vmap
+            check_contact(self.contact)
 
     @property
     def num_changes(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -285,10 +288,19 @@ class LeastSquares(Cost):
         """Return the residuals of the last state."""
 
     def stage(self, system: System, state: StateVector, control: ControlVector) -> Float[Array, ""]:
-        return 0.5 * jnp.sum(self.residuals(system, state, control) ** 2)
+        return 0.5 * jnp.sum(_residuals(self, "residuals", system, state, control) ** 2)
 
     def terminal(self, system: System, state: StateVector) -> Float[Array, ""]:
-        return 0.5 * jnp.sum(self.terminal_residuals(system, state) ** 2)
+        return 0.5 * jnp.sum(_residuals(self, "terminal_residuals", system, state) ** 2)
+
+
+def _residuals(cost: Cost, method: str, *given: Any) -> Float[Array, " residuals"]:
+    """Return what a method of the subclass gave as floats."""
+    name = f"{method} of {type(cost).__name__}"
+    vector = real(name, getattr(cost, method)(*given))
+    if vector.ndim != 1:
+        raise ValueError(f"{name} must return a vector, got shape {vector.shape}")
+    return vector.astype(jnp.result_type(vector, float))
 
 
 class GoalCost(LeastSquares):
@@ -343,14 +355,16 @@ class Quadratic(eqx.Module):
 
 def stage_model(cost: Cost, system: System, state: StateVector, control: ControlVector) -> Quadratic:
     """Return the expansion of the cost of a step around a state and a control."""
-    n, function = system.num_changes, cost.residuals if isinstance(cost, LeastSquares) else cost.stage
+    is_squares, n = isinstance(cost, LeastSquares), system.num_changes
+    function = functools.partial(_residuals, cost, "residuals") if is_squares else cost.stage
     moved = lambda change: function(system, system.retract(state, change[:n]), control + change[n:])  # noqa: E731
     return _model(cost, moved, jnp.zeros(n + control.size, state.dtype))
 
 
 def terminal_model(cost: Cost, system: System, state: StateVector) -> Quadratic:
     """Return the expansion of the terminal cost around the last state."""
-    function, n = cost.terminal_residuals if isinstance(cost, LeastSquares) else cost.terminal, system.num_changes
+    is_squares, n = isinstance(cost, LeastSquares), system.num_changes
+    function = functools.partial(_residuals, cost, "terminal_residuals") if is_squares else cost.terminal
     return _model(cost, lambda change: function(system, system.retract(state, change)), jnp.zeros(n, state.dtype))
 
 

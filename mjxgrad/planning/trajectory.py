@@ -36,6 +36,7 @@ _SHORTENING = 0.5 ** np.arange(8)
 _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first one has
 _USUAL = 0.05  # of a control's range, and _UNLIMITED where it has none: the deviation of random changes
 _UNLIMITED = 0.1
+_TRUSTED = 0.8  # of what a linear model promises: where as much comes true, no random change is taken
 _KEPT = 0.2  # of what linear models promised; where less came true, random changes are advised
 
 
@@ -219,7 +220,11 @@ class Problem(eqx.Module):
         steps = jnp.pad(jnp.array((0.0, *_STEPS), dtype), (0, len(noise)))
         added = jnp.pad(noise.astype(dtype), ((len(steps) - len(noise), 0), (0, 0), (0, 0)))
         tried = jax.vmap(lambda *at: self.run(smoother, search.course, law, *at))(steps, added)
-        is_valid = (jnp.arange(len(steps)) == 0) | (~is_first & (law.is_sound | (steps == 0)))
+        came = tried.cost[0] - jnp.min(tried.cost[: 1 + len(_STEPS)])
+        is_random = jnp.arange(len(steps)) > len(_STEPS)
+        # A random change may cost less than a full step of a model that holds, but is a step towards nothing.
+        keeps = law.is_sound & (came >= _TRUSTED * law.promised)
+        is_valid = (jnp.arange(len(steps)) == 0) | (~is_first & jnp.where(is_random, ~keeps, law.is_sound))
         index = jnp.argmin(jnp.where(is_valid, tried.cost, jnp.inf))
         course = jax.tree.map(lambda x: x[index], tried)
         is_exact = isinstance(smoother, Analytic) and smoother.smoothing is None

@@ -158,3 +158,25 @@ def test_an_unknown_environment_or_render_mode_is_refused(cart, kind):
         kind("dog")
     with pytest.raises(ValueError, match="render_mode must be \"rgb_array\" or None, got 'human'"):
         kind(cart, render_mode="human")
+    with pytest.raises(ValueError, match=r"an option must be one of 'render_mode', 'height', .* got 'widht'"):
+        kind(cart, widht=64)
+
+
+def test_a_number_of_copies_must_be_a_count(cart):
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        GymVectorEnv(cart, num_envs=0)
+
+
+@pytest.mark.parametrize("kind", [GymEnv, GymVectorEnv])
+def test_what_needs_a_reset_says_so_as_gymnasium_does(cart, kind):
+    env = kind(cart, render_mode="rgb_array")
+    for method, given in ((env.step, [ACTION]), (env.render, [])):
+        said = rf"Cannot call env\.{method.__name__}\(\) before calling env\.reset\(\)"
+        with pytest.raises(gymnasium.error.ResetNeeded, match=said):
+            method(*given)
+
+
+def test_an_action_of_another_form_is_refused(many):
+    many.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action must have shape \(3, 1\), got \(2, 1\)$"):
+        many.step(np.zeros((2, 1)))

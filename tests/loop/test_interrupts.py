@@ -113,3 +113,49 @@ def test_ctrl_c_that_python_ignores_comes_again(monkeypatch, within_command, cap
             work()
     assert time.perf_counter() - began < 2
     assert "ignored" not in capfd.readouterr().err
+
+
+@jax.jit
+def _counted(x):
+    """One more, by two calls back of 0.05 s."""
+
+    def wait(x):
+        time.sleep(PAUSE / 2)
+        return np.asarray(x) + 0.5
+
+    call = lambda x: jax.pure_callback(wait, jax.ShapeDtypeStruct((), x.dtype), x)  # noqa: E731
+    return call(jnp.sin(call(x)) * 0 + x + 0.5)
+
+
+@pytest.mark.parametrize("after", [0.22, 0.27, 0.31])
+def test_ctrl_c_ends_ones_own_loop_after_a_step_and_not_within(after):
+    """XLA makes its own error of an interruption in a function that it calls back. A second Ctrl-C comes at once."""
+    _interrupts.wait_for_programs()
+    _counted(jnp.zeros(())).block_until_ready()
+    x, num = jnp.zeros(()), 0
+    threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt):
+        while time.perf_counter() < began + 10:
+            x = _counted(x).block_until_ready()
+            num += 1
+    assert time.perf_counter() - began < 2
+    assert float(x) in (num, num + 1)
+    time.sleep(0.05)  # no second one comes
+
+
+def test_a_second_ctrl_c_comes_at_once():
+    """Within a function that takes 5 s, of which XLA then makes its own error."""
+
+    def wait(x):
+        time.sleep(5)
+        return np.asarray(x)
+
+    _interrupts.wait_for_programs()
+    slow = jax.jit(lambda x: jax.pure_callback(wait, jax.ShapeDtypeStruct((), x.dtype), x)).lower(0.0).compile()
+    for after in (0.3, 0.6):
+        threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)).start()
+    began = time.perf_counter()
+    with pytest.raises((jax.errors.JaxRuntimeError, ValueError, KeyboardInterrupt)):
+        slow(0.0).block_until_ready()
+    assert 0.5 < time.perf_counter() - began < 2

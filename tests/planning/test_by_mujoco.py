@@ -48,7 +48,8 @@ def start_of(system):
 
 def controller_of(system):
     goal = jax.jit(system.retract)(system.origin, 0.3 * jnp.ones(system.num_changes).at[2:5].set(0.0))
-    return Controller(system, GoalCost(goal, 1.0, 10.0, 0.01), jnp.zeros((HORIZON, 2)), schedule=[1.0, 1.0])
+    cost, given = GoalCost(goal, 1.0, 10.0, 0.01), jnp.zeros((HORIZON, 2))
+    return Controller(system, cost, given, schedule=[1.0, 1.0], num_samples=0)
 
 
 def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):

@@ -28,7 +28,7 @@ def pendulum(state, control):
 def made():
     system = FunctionSystem(pendulum, 2, 1)
     with pytest.warns(UserWarning, match="an iteration takes about"):
-        return Controller(system, COST, GIVEN, schedule=[1.0, 1.0], first_schedule=np.ones(5), deadline=1e-9, upper=2.0)
+        return Controller(system, COST, GIVEN, schedule=[1.0, 1.0], first_schedule=np.ones(5), num_samples=0, deadline=1e-9, upper=2.0)
 
 
 @pytest.fixture
@@ -194,7 +194,7 @@ def test_where_nothing_is_better_the_shifted_plan_is_done():
     """A step without derivative: every iteration repeats the controls it begins at."""
     system = FunctionSystem(lambda state, control: state + control + jnp.sqrt(state - state), 1, 1)
     cost = GoalCost(jnp.zeros(1), 1.0, 1.0, 1.0)
-    controller = Controller(system, cost, jnp.array([[0.1], [0.2], [0.4]]))
+    controller = Controller(system, cost, jnp.array([[0.1], [0.2], [0.4]]), num_samples=0)
     assert controller(np.zeros(1)) == 0.1
     assert str(controller).endswith("Controls are as given, since no small change lowers the cost: begin with others")
     assert [controller(np.zeros(1)).item() for _ in range(3)] == [0.2, 0.4, 0.4]

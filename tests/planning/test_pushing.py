@@ -44,7 +44,7 @@ def system():
 
 @pytest.fixture(scope="module")
 def made(system):
-    return Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)))
+    return Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)), num_samples=0)
 
 
 @pytest.fixture
@@ -55,18 +55,23 @@ def controller(made):
 
 
 @pytest.mark.filterwarnings("ignore:no control moves")
-def test_boxes_are_pushed_to_their_goal(controller):
-    """From 11 to 15 cm away. A push beside the middle turns a box, and rounding decides how far: so the median is judged."""
+def test_boxes_are_pushed_to_their_goal_and_stay(system):
+    """From 11 to 15 cm away. A push beside the middle turns a box, and rounding decides how far: so the median is judged.
+
+    With random changes of plans the median was 1.0 to 2.4 cm in eight runs and the worst 8, without them 2.4 to 4.4 and 22.
+    """
+    controller = Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)))
     model, found = mujoco.MjModel.from_xml_string(PUSHER), []
     for place in [(0.0, 0.0), (0.03, -0.03), (-0.01, 0.02), (0.015, -0.015), (0.04, 0.02)]:
         controller.reset()
         data = mujoco.MjData(model)
         data.qpos[2:4] = place
-        for _ in range(100):
+        for k in range(60):
             data.ctrl[:] = controller(data)
             mujoco.mj_step(model, data, SUBSTEPS)
-        found.append(np.linalg.norm(data.qpos[2:4] - GOAL))
-    assert np.median(found) < 0.04
+            if k >= 40:
+                found.append(np.linalg.norm(data.qpos[2:4] - GOAL))
+    assert np.median(found) < 0.035
 
 
 def test_where_nothing_is_touched_a_warning_says_what_to_do(controller, system):
