@@ -22,7 +22,7 @@ from mjxgrad.objective.base import as_scalar
 from mjxgrad.objective.task import InScene, as_pytree
 from mjxgrad.rollouts import State, initial_state, rollout
 from mjxgrad.scene import Scene
-from mjxgrad.stepping import Contact, Discrete, check_contact
+from mjxgrad.stepping import Contact, Discrete
 
 _DIVERGED = "diverged"  # in the metrics, beside the terms of the reward
 Rewards = dict[str, Float[Array, ""]]
@@ -91,8 +91,6 @@ class Environment(InScene):
         for name in ("frame_skip", "episode_length"):
             whole(name, getattr(self, name))
         function("randomisation", self.randomisation, "key", "scene")
-        if not isinstance(self.contact, Contact):  # lengths with a leading axis may be for jax.vmap
-            check_contact(self.contact)
 
     @abstractmethod
     def observe(self, state: State, memory: PyTree) -> Float[Array, " obs"]:

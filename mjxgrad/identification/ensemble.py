@@ -37,7 +37,8 @@ _SHORT, _SETTLED = 0.7, 1.5  # at the end: step of each number in widths; ratio 
 _SURE = 0.003  # width of a coordinate: where all but noise is explained, narrower intervals are not worth the time
 # Ensembles at least, and those at the end of which the mean is the answer: each has its scatter.
 _FEWEST, _AVERAGED = 3, 3
-_BY_CHANCE = 3.0  # standard deviations of what errors of a derivative have for squares, beyond which it is no error
+# Standard deviations of the squares of a derivative's errors, beyond which it is none: chatter has long tails.
+_BY_CHANCE = 5.0
 _HALF_WIDTH = 1.96  # of an interval that holds at 95 %, in standard errors
 
 Box = tuple[Float[np.ndarray, " dim"], Float[np.ndarray, " dim"]]

@@ -99,7 +99,9 @@ def distinct(gram: Float[np.ndarray, "dim dim"], error: Float[np.ndarray, "dim d
         for i in np.argsort(np.abs(row))[:-1]:
             fewer = parts[parts != i]
             ratio, those = scipy.linalg.eigh(effect[np.ix_(fewer, fewer)], doubt[np.ix_(fewer, fewer)])
-            if ratio[0] <= 1.0:
+            # Two of which each alone could be error, but not both, are told by their sum.
+            is_pair = len(fewer) == 1 and effect[i, i] <= doubt[i, i]
+            if ratio[0] <= 1.0 and not is_pair:
                 parts, least = fewer, those[:, 0]
         if len(parts) > 1:
             one = np.zeros_like(row)

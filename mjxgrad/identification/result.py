@@ -339,7 +339,7 @@ def statistics(
         "half_width": half_width,
         "condition_number": float(sizes[0] / sizes[-1]) if sizes.size and sizes[-1] > 0 else np.inf,
         "without_effect": tuple(names[~is_felt].tolist()),
-        "inseparable": _combinations(blurred / lengths[is_felt], values[is_felt], names[is_felt]),
+        "inseparable": _combinations(blurred, lengths[is_felt], values[is_felt], names[is_felt]),
     }
 
 
@@ -348,12 +348,16 @@ def exceeds_noise(rms: float, freedom: int, chance: float = CHANCE) -> bool:
     return bool(scipy.special.chdtrc(max(freedom, 1), rms**2 * max(freedom, 1)) < chance)
 
 
-def _combinations(blurred: np.ndarray, values: np.ndarray, names: np.ndarray) -> tuple[dict[str, float], ...]:
+def _combinations(
+    blurred: np.ndarray, lengths: np.ndarray, values: np.ndarray, names: np.ndarray
+) -> tuple[dict[str, float], ...]:
     """Return directions without effect as relative changes of few numbers, the first by one per cent."""
-    relative = blurred / np.where(values != 0, values, 1.0)
+    effects = lengths * np.where(values != 0, values, 1.0)
     found = []
-    for row in simple(relative):
-        parts = np.flatnonzero(np.abs(row) > _SMALL_PART * np.abs(row).max())
+    for row in simple(blurred / effects):
+        # A small change of what is large can undo all that the large one of a small number does.
+        is_part = [np.abs(one) > _SMALL_PART * np.abs(one).max() for one in (row, row * effects)]
+        parts = np.flatnonzero(is_part[0] | is_part[1])
         found.append({str(names[i]): float(0.01 * row[i] / row[parts[0]]) for i in parts})
     return tuple(found)
 

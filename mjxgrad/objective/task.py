@@ -89,6 +89,8 @@ class InScene(eqx.Module):
 
     def __check_init__(self):
         check_scene(self.scene)
+        if not isinstance(self.contact, Contact):  # lengths with a leading axis may be for jax.vmap
+            check_contact(self.contact)
 
     def with_contact(self: Same, contact: Contact) -> Same:
         """Return a copy whose contacts are stepped otherwise."""

@@ -19,7 +19,7 @@ from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
 from mjxgrad.planning.linear_model import Analytic, Exact, Smoother
 from mjxgrad.planning.system import Cost, SceneSystem, System
-from mjxgrad.planning.trajectory import FREE, Course, Problem, deviations, posed, random_changes
+from mjxgrad.planning.trajectory import FREE, NO_COST, Course, Problem, deviations, posed, random_changes
 from mjxgrad.rollouts import State
 
 _SAMPLES = 16  # random changes of a plan, for 15 % of a decision's time where a finger pushes a box
@@ -45,6 +45,7 @@ class Controller(Printed):
         price: seconds of each part of a decision without a deadline, as measured when the controller was made: at the scene's
             first key frame, without any at the system's origin.
         seconds: durations of the decisions since the last reset (s).
+        costs: cost of the plan after each of them; infinite where it was not computed in time.
         num_cut: number of decisions that the deadline cut short.
         num_missed: number of decisions that ended after it.
         compile_seconds: duration of the compilation (s).
@@ -74,10 +75,10 @@ class Controller(Printed):
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
             first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
-            num_samples: plans with random changes that are tried beside the step lengths, see `optimise_trajectory`: they find
-                what derivatives do not see, and get past where a push turns a body. None takes 16, none with a smoother such as
-                `Sampled`, whose steps are many. Where an iteration is spread over decisions, they are tried in each that has
-                the time, else in every other one.
+            num_samples: plans with random changes that are tried beside the step lengths, see `optimise_trajectory`: they reach
+                contacts that derivatives do not see, and get past where a push turns a body. None takes 16, and none with a
+                smoother such as `Sampled`, whose steps are many. Where an iteration is spread over decisions, they are tried in
+                each that has the time, else in every other one.
             stddev: standard deviation of these changes.
             deadline: the time of a decision (s); one part of an iteration is taken at least. Where it is shorter than an
                 iteration more is compiled, to foretell from plans of two lengths what fits.
@@ -152,6 +153,7 @@ class Controller(Printed):
         self._search, self._turn, self.num_missed, self.num_cut = self._iteration.blank, self._iteration.first, 0, 0
         self._taken: dict[str, list[float]] = {part: [] for part in PARTS}
         self.seconds: list[float] = []
+        self.costs: list[float] = []
 
     @property
     def plan(self) -> Course:
@@ -165,7 +167,8 @@ class Controller(Printed):
             state: the present state: a vector of the system, or for a scene its `State` or C MuJoCo's data.
 
         Warns:
-            UserWarning: in the first decision, if no control moves something that has a cost, and the cost hardly falls.
+            UserWarning: in the first decision, if no control moves something that has a cost, and the cost hardly falls; and if
+                the cost of the given controls is no finite number.
 
         Raises:
             ValueError: if the state has another size than the system's, or is not finite.
@@ -178,6 +181,12 @@ class Controller(Printed):
         self._iterate(self._schedules[0 if is_first else 1], limit)
         self.seconds.append(time.perf_counter() - began)
         self.num_missed += began + self.seconds[-1] > limit
+        self.costs.append(float(self.plan.cost))
+        if is_first and not np.isfinite(given):
+            is_cost = np.isfinite(self.plan.states).all()
+            warnings.warn(
+                NO_COST if is_cost else "the motion under the given controls leaves finite numbers", stacklevel=2
+            )
         if is_first and np.asarray(self._search.unmoved).any() and not float(self.plan.cost) < _LITTLE * given:
             warnings.warn(self._untouched(), stacklevel=2)
         return np.array(self.plan.controls)[0]
@@ -301,8 +310,13 @@ class Controller(Printed):
         places = np.flatnonzero(self._search.unmoved)
         told = f"no control moves {self.system.named(places)}, which has a cost: where nothing touches, derivatives are zero"
         more = f"num_samples={2 * self.num_samples or _SAMPLES}"
-        helps = f"add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take {more}"
+        helps = (
+            f"add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take {more}"
+        )
         return f"{told}; {helps}"
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self}>"
 
     def __str__(self) -> str:
         if not self.seconds:
@@ -315,9 +329,13 @@ class Controller(Printed):
         parts = {part: float(np.median(taken)) for part, taken in self._taken.items()}
         parts[PARTS[0]] *= self._iteration.num_pieces
         told += f". An iteration took {_ms(sum(parts.values()))}: {_listed(parts)}; compiled in {self.compile_seconds:.1f} s"
+        if len(costs := [cost for cost in self.costs if np.isfinite(cost)]) > 1:
+            middle, last = format_number(float(np.median(costs))), format_number(costs[-1])
+            told += f". Plans cost {middle} in the median, the last {last}"
         if not np.array_equal(self.plan.controls, self._iteration.blank.best.controls):
             return told
-        idle = "no small change lowers the cost: begin with others"
+        is_known = not self.costs or np.isfinite(self.costs).any()
+        idle = "no small change lowers the cost: begin with others" if is_known else NO_COST
         return f"{told}. Controls are as given, since {self._untouched() if self._search.unmoved.any() else idle}"
 
 

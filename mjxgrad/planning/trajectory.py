@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, Real
 
-from mjxgrad._arrays import instance, is_known, known, one_key, real, traceable, whole
+from mjxgrad._arrays import Legible, instance, is_known, known, one_key, real, traceable, whole
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
@@ -36,6 +36,7 @@ _SHORTENING = 0.5 ** np.arange(8)
 _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of the deviation that the first one has
 _USUAL = 0.05  # of a control's range, and _UNLIMITED where it has none: the deviation of random changes
 _UNLIMITED = 0.1
+NO_COST = "the cost of the given controls is no finite number, though all their states are"
 _TRUSTED = 0.8  # of what a linear model promises: where as much comes true, no random change is taken
 _KEPT = 0.2  # of what linear models promised; where less came true, random changes are advised
 
@@ -91,6 +92,8 @@ class Plan(eqx.Module, Printed):
                 "which have a cost, so derivatives are zero; start with controls that touch, take num_samples=32, or smooth "
                 "by Analytic"
             )
+        if not np.isfinite(self.cost) and np.isfinite(self.states).all():
+            return f"not improved: {NO_COST}"
         if self.diverged:
             return "the smoothed system left finite numbers; use shorter time steps, or tighter limits"
         if not jnp.isfinite(self.iterations.promised[-1]):
@@ -133,7 +136,7 @@ class Feedback(eqx.Module):
     is_sound: Bool[Array, ""]
 
 
-class Course(eqx.Module):
+class Course(Legible):
     """A trajectory, its controls and its cost."""
 
     states: Float[Array, "states state"]

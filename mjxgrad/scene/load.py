@@ -198,10 +198,6 @@ def _converted(
     """Return the C model, the model for MJX, the conversions, and the reason why MJX cannot step it, if any."""
     original = copy.deepcopy(model)
     try:
-        if engine is not None and engine in OF_FILES:
-            raise SceneError(
-                f"{name} was loaded for {OF_FILES[engine]}, engine={engine!r}; without engine= MJX steps it, if it can"
-            )
         if count_pairs(model) > MOST_PAIRS:
             raise SceneError(
                 f"{name} must have at most {MOST_PAIRS} pairs of geoms that can touch, got more: give geoms that never "
@@ -219,6 +215,10 @@ def _converted(
         if refused:
             listed = "\n".join(f"  - {message}" for message in refused)
             raise SceneError(f"{name} cannot be stepped by MJX for {len(refused)} reasons:\n{listed}")
+        if engine is not None and engine in OF_FILES:  # only now, so that the hint is of no file that MJX cannot step
+            raise SceneError(
+                f"{name} was loaded for {OF_FILES[engine]}, engine={engine!r}; without engine= MJX steps it"
+            )
         conversions += [c for rule in rules.AFTER_REFUSALS for c in rule(model)]
         stepped = copy.deepcopy(model)
         conversions += list(rules.drop_sensors(stepped))

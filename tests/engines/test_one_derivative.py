@@ -191,6 +191,9 @@ def test_a_scene_is_stepped_by_the_engine_that_was_chosen(scene):
     flexible = mg.load_scene(LINKS, engine="mujoco")
     with pytest.raises(ValueError, match="was loaded for C MuJoCo"):
         flexible.with_engine("mjx")
+    # No hint to MJX where MJX cannot step the file.
+    with pytest.raises(ValueError, match="cannot be stepped by MJX"):
+        mg.load_scene(DELAYED.format("Euler"), engine="mujoco").with_engine("mjx")
 
 
 DELAYED = """<mujoco><option timestep=".01" integrator="{}"/><worldbody><body><joint name="j" axis="0 1 0" damping=".1"/>

@@ -67,6 +67,19 @@ def test_motions_taken_for_recordings_tell_how_sure_the_values_are(count, expect
     assert abs(size / expected - 1) < 0.25
 
 
+def test_chatter_does_not_tell_apart_what_has_one_effect():
+    """Two numbers whose sum alone is seen beside a third: of 192 motions derivatives of the two differ by chatter."""
+    rng = np.random.default_rng(0)
+    motions, *_ = _problem(1.0, 3.0, rng)
+    drawn, starts = 0.1 * rng.normal(size=(192, 3)), rng.normal(size=(192, _WINDOWS, 3))
+    model = Regression(drawn, starts, motions(np.column_stack([drawn[:, 0] + drawn[:, 1], drawn[:, 2]]), starts))
+    *_, slope, _ = split(model.weighed(1.0), 3)
+    np.testing.assert_allclose(slope[:, 0], slope[:, 1], atol=0.2 * np.abs(slope[:, 0]).max())
+    _, sizes, right = np.linalg.svd(slope)
+    assert sizes[2] < 1e-9 * sizes[1]
+    np.testing.assert_allclose(np.abs(right[2]), np.sqrt([0.5, 0.5, 0.0]), atol=0.05)
+
+
 def test_motions_that_diverge_do_not_count_unless_most_do():
     motions, *_ = _problem(1.0, 0.0, np.random.default_rng(0))
 

@@ -18,6 +18,11 @@ _STEP, _STEPS = 0.01, 40
 _CART = """<mujoco><option timestep="0.01"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
   <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x" gear="3"/></actuator>
   <sensor><jointpos name="place" joint="x"/></sensor></mujoco>"""
+_SLED = """<mujoco><option timestep=".004" integrator="implicitfast"/><worldbody>
+  <geom type="plane" pos="0 0 -.05" size="1 1 .1"/><body><joint name="x" type="slide" axis="1 0 0" damping="8"/>{}
+  <geom type="box" size=".05 .05 .05" mass=".4" {}/></body></worldbody>
+  <actuator><position name="servo" joint="x" kp="400" kv="20"/></actuator></mujoco>"""
+_ON_FLOOR, _ALONE = ('<joint type="slide" axis="0 0 1"/>', ""), ("", 'contype="0" conaffinity="0"')
 _DRIVE = 2 * np.sin(np.arange(_STEPS) / 5)
 
 
@@ -397,6 +402,44 @@ def test_what_recordings_cannot_tell_is_said_before_a_search(cart):
     error = 1e-3 / np.linalg.norm(_course(gear=1.0))
     np.testing.assert_allclose(np.sqrt(alone.told["covariance"][0, 0]), error, rtol=0.02)
     assert alone.num_motions > 0 < alone.seconds < 5
+
+
+@pytest.mark.usefixtures("few_starts")
+@pytest.mark.parametrize(("floor", "noise"), [(False, 1e-4), (False, 1e-2), (True, 1e-4)])
+def test_damping_and_the_servo_s_are_one_force_and_told_as_their_sum(floor, noise):
+    """Secants of the two differ by their widths, and on a floor, where contacts chatter, by jumps: neither tells them apart.
+
+    Of the true sum, 12 + 20, values of any two are found; the stiffness of 320 is told all the same.
+    """
+    scene = mg.load_scene(_SLED.format(*_ON_FLOOR if floor else _ALONE), engine="mujoco")
+    controls = 0.1 * np.sin(np.arange(60) / 8)[:, None]
+    places = mg.rollout(
+        scene.with_model(
+            dof_damping=scene.model.dof_damping.at[0].set(12.0),
+            actuator_gainprm=scene.model.actuator_gainprm.at[0, 0].set(320.0),
+            actuator_biasprm=scene.model.actuator_biasprm.at[0, 1].set(-320.0),
+        ),
+        mg.initial_state(scene),
+        controls,
+    ).qpos
+    measured = np.asarray(places) + noise * np.random.default_rng(0).normal(size=places.shape)
+    recording = Recording({"qpos": measured}, controls, noise={"qpos": noise}, start=mg.initial_state(scene))
+    parameters = {"damping": identification.damping(scene, "x"), "servo": identification.gains(scene, "servo")}
+    before = identification.outlook(scene, parameters, [recording])
+    assert before.is_rugged == floor
+    (combination,) = before.told["inseparable"]
+    assert combination == {"damping": 0.01, "servo[1]": pytest.approx(-0.01 * 8 / 20, rel=0.1)}
+    assert "not told: damping with servo[1]" in before.summary()
+    assert "+1 % of damping with -0.4 % of servo[1] changes nothing" in before.summary()
+    assert np.isfinite(before.told["half_width"]).tolist() == [False, True, False]
+    result = mg.identify(scene, parameters, [recording])
+    (combination,) = result.inseparable
+    assert set(combination) == {"damping", "servo[1]"}
+    assert "Cannot be told apart: damping, servo[1]" in result.summary()
+    assert np.isinf([result.half_width["damping"], result.half_width["servo"][1]]).all()
+    stiffness, damping = result.values["servo"]
+    assert abs(stiffness - 320) < result.half_width["servo"][0] < 2e4 * noise
+    np.testing.assert_allclose(result.values["damping"] + damping, 32.0, rtol=0.02 if noise < 1e-3 else 0.2)
 
 
 @pytest.mark.parametrize(

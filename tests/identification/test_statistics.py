@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mjxgrad.identification.normal import factors_of, solved, split
+from mjxgrad.identification.normal import distinct, factors_of, solved, split
 from mjxgrad.identification.parameters import Coordinates, Parameter
 from mjxgrad.identification.result import statistics
 
@@ -58,6 +58,31 @@ def test_combinations_that_cannot_be_told_apart_are_named_with_their_shares():
     assert named["a", "b"]["b"] / named["a", "b"]["a"] == pytest.approx(0.5)
     assert named["c", "d"]["d"] / named["c", "d"]["c"] == pytest.approx(-1.0)
     np.testing.assert_array_equal(np.isfinite(found.half_width), [False, False, False, False, True])
+
+
+def test_what_undoes_a_small_number_is_named_where_it_is_large_itself():
+    """The sum alone is seen of 0.1 and 9: a per cent of the one is a ninetieth of that of the other."""
+    rng = np.random.default_rng(5)
+    slope = rng.normal(size=25)[:, None] * np.ones(2)
+    (combination,) = _judge(slope, rng.normal(size=25), a=0.1, b=9.0).inseparable
+    assert combination == {"a": 0.01, "b": pytest.approx(-0.01 * 0.1 / 9.0)}
+
+
+def test_columns_that_differ_by_their_errors_alone_are_not_told_apart():
+    """Two numbers, a and b, have one effect; c and d differ by ten errors, and e has an effect of its own."""
+    rng = np.random.default_rng(4)
+    one, other, apart, last = rng.normal(size=(4, 200))
+    exact = np.column_stack([2 * one, -3 * one, other, other + 0.1 * apart, last])
+    slope = exact + 0.01 * rng.normal(size=exact.shape)
+    expected = 1.3 * len(slope) * 0.01**2 * np.eye(5)  # chi-square of 200 is that much at three standard deviations
+    found = slope @ distinct(slope.T @ slope, expected)
+    (combination,) = _judge(found, rng.normal(size=200), a=1.0, b=1.0, c=1.0, d=1.0, e=1.0).inseparable
+    assert combination == {"a": 0.01, "b": pytest.approx(0.01 * 2 / 3, rel=0.01)}
+    np.testing.assert_allclose(found[:, 2:], slope[:, 2:], rtol=1e-12)
+    np.testing.assert_array_equal(distinct(slope[:, 1:].T @ slope[:, 1:], expected[1:, 1:]), np.eye(4))
+    # A number whose effect is less than its error is one that is not known, and no sum of others.
+    weak = slope[:, 1:] * [1e-3, 1, 1, 1]
+    np.testing.assert_array_equal(distinct(weak.T @ weak, expected[1:, 1:]), np.eye(4))
 
 
 def test_unknown_starts_widen_the_intervals_as_in_one_regression_of_all():

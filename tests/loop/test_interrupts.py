@@ -135,10 +135,13 @@ def test_ctrl_c_ends_ones_own_loop_after_a_step_and_not_within(after):
     x, num = jnp.zeros(()), 0
     threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)).start()
     began = time.perf_counter()
-    with pytest.raises(KeyboardInterrupt):
+    try:
         while time.perf_counter() < began + 10:
             x = _counted(x).block_until_ready()
             num += 1
+        pytest.fail("Ctrl-C was not heard")
+    except KeyboardInterrupt:
+        pass
     assert time.perf_counter() - began < 2
     assert float(x) in (num, num + 1)
     time.sleep(0.05)  # no second one comes

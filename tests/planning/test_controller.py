@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.planning import Controller, Exact, FunctionSystem, GoalCost, SceneSystem, optimise_trajectory
+from mjxgrad.planning import Controller, Cost, Exact, FunctionSystem, GoalCost, SceneSystem, optimise_trajectory
 from mjxgrad.planning.iteration import Iteration
 
 START, GIVEN = np.array([1.0, -0.5]), jnp.full((8, 1), 0.1)
@@ -28,7 +28,9 @@ def pendulum(state, control):
 def made():
     system = FunctionSystem(pendulum, 2, 1)
     with pytest.warns(UserWarning, match="an iteration takes about"):
-        return Controller(system, COST, GIVEN, schedule=[1.0, 1.0], first_schedule=np.ones(5), num_samples=0, deadline=1e-9, upper=2.0)
+        return Controller(
+            system, COST, GIVEN, schedule=[1.0, 1.0], first_schedule=np.ones(5), num_samples=0, deadline=1e-9, upper=2.0
+        )
 
 
 @pytest.fixture
@@ -240,3 +242,29 @@ def test_a_scene_is_planned_by_c_mujoco_as_by_mjx(gradient):
     given = (jnp.array([0.1, 1.0]), jnp.array([0.5]), jax.random.key(0))
     models = [jax.jit(lambda s=s: Exact().linear_model(s, *given))() for s in systems]
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5), *models)
+
+
+def test_a_cost_that_is_no_number_is_said():
+    """The pendulum moves on; the cost alone is NaN, as of a root below zero."""
+
+    class Root(Cost):
+        def stage(self, system, state, control):
+            return jnp.sqrt(-1 - state @ state) + control @ control
+
+        def terminal(self, system, state):
+            return state @ state
+
+    cost = Root()
+    made = Controller(FunctionSystem(pendulum, 2, 1), cost, GIVEN)
+    with pytest.warns(UserWarning, match="no finite number, though all their states are"):
+        made(START)
+    assert str(made).endswith("no finite number, though all their states are")
+    how = {"smoother": Exact(), "schedule": jnp.ones(2)}
+    plan = optimise_trajectory(FunctionSystem(pendulum, 2, 1), cost, START, GIVEN, jax.random.key(0), **how)
+    assert "no finite number, though all their states are" in str(plan)
+
+
+def test_what_plans_cost_is_printed(made):
+    made.reset()
+    made.seconds, made.costs = [0.1, 0.1, 0.1], [3.0, np.inf, 5.0]
+    assert "Plans cost 4 in the median, the last 5" in str(made)
