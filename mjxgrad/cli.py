@@ -124,6 +124,7 @@ def check(
     scene: str,
     *,
     cost: str | None = None,
+    start: str | None = None,
     html: Path | None = None,
     quick: Switch = False,
     mjx: Switch = False,
@@ -135,6 +136,7 @@ def check(
     Args:
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; or height:body and others, see `sweep`.
+        start: a key frame by name, about whose controls all motions are; by default all key frames and the reference pose.
         html: write a page to this file.
         quick: only fast checks, in seconds: contact, time step, parts without effect, one value and derivative of the cost.
         mjx: compare a step by MJX with C MuJoCo's, too, which takes up to a minute to compile.
@@ -148,7 +150,8 @@ def check(
     log = _timed()
     log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
     mg = _library()
-    verdict = mg.check(scene, cost, derivatives=not quick, mjx=mjx, budget=budget, seed=seed, log=log)
+    given = {"start": start, "budget": budget, "seed": seed, "log": log}
+    verdict = mg.check(scene, cost, derivatives=not quick, mjx=mjx, **given)
     _print(finished(verdict.summary), sys.stdout)
     if html is not None:
         finished(lambda: write(html, verdict.as_html()))
@@ -296,12 +299,13 @@ def identify(
 
 
 @app.command
-def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) -> None:
+def new(scene: str, *, output: Path = Path("task.py"), start: str | None = None, force: Switch = False) -> None:
     """Write a program that optimises a motion of a scene and films it, with the settings that a check recommends.
 
     Args:
         scene: an MJCF file, with actuators.
         output: the program to write.
+        start: a key frame by name, from which its motion begins; by default the first, else the reference pose.
         force: overwrite an existing program.
     """
     if output.suffix != ".py":  # of the same name with .mp4 is its film
@@ -315,7 +319,7 @@ def new(scene: str, *, output: Path = Path("task.py"), force: Switch = False) ->
     if not mg.load_scene(scene, engine=quick).mj_model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     log("checks the scene for up to 20 s; Ctrl-C ends that sooner")
-    verdict = mg.check(scene, log=log)
+    verdict = mg.check(scene, start=start, log=log)
     program = importlib.import_module("mjxgrad.checking.check").program
     text, seconds = program(verdict, str(Path(scene)), str(output.with_suffix(".mp4")))
     write(output, text)

@@ -41,6 +41,7 @@ from mjxgrad.diagnostics.stability import StabilityReport, check_stability
 from mjxgrad.engines import ENGINES, QUICK
 from mjxgrad.objective.task import as_pytree, checked_cost
 from mjxgrad.report import INK, Block, page, svg
+from mjxgrad.rollouts.start import key_of
 from mjxgrad.scene import Scene, SceneWarning, load_scene
 
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
@@ -73,6 +74,7 @@ class Verdict(Paged):
         measured: measurements of derivatives; None if derivatives were not asked for.
         seconds: duration in s of a time step of a "motion", and of its "discrete" gradient and its "slope", by C MuJoCo on
             all cores; none without actuators.
+        start: the key frame that was asked for; None for all.
     """
 
     name: str
@@ -86,6 +88,7 @@ class Verdict(Paged):
     motions: Motions
     measured: Measured | None
     seconds: dict[str, float]
+    start: str | int | None
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -139,6 +142,7 @@ def check(
     source: Source,
     cost: str | Cost | None = None,
     *,
+    start: str | int | None = None,
     derivatives: bool = True,
     mjx: bool = False,
     budget: int | float = 12.0,
@@ -156,6 +160,8 @@ def check(
         source: an MJCF file, MJCF as a string, a `MjSpec`, a `MjModel` or a scene.
         cost: function from a trajectory, also a shorter one, to its cost, as `SceneTask` takes it, or its name as in `sweep`;
             motions are then simulated from their start. None uses random mixes of final positions and velocities.
+        start: a key frame, by name or index, from which all motions begin, about its controls. None takes all key frames and
+            the reference pose, and controls about the middle of their ranges.
         derivatives: whether to measure derivatives; False looks at motions alone, and calls a cost once.
         mjx: whether to compare a step by MJX with C MuJoCo's, too; it takes up to a minute to compile.
         budget: approximate duration in s, half of it for motions and derivatives. Slow scenes get fewer steps. The verdict names
@@ -168,7 +174,8 @@ def check(
         The verdict; `print` it.
 
     Raises:
-        ValueError: if `budget` is not positive, or the cost does not return a number or numbers to be added up.
+        ValueError: if `budget` is not positive, there is no such key frame, or the cost does not return a number or numbers to
+            be added up.
         SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
     instance("derivatives", derivatives, bool, "True or False")
@@ -186,10 +193,11 @@ def check(
         # By C MuJoCo, as is measured and advised: what MJX would do otherwise is asked for by `mjx`.
         engine = QUICK if device.is_cpu() and not mjx else None
         scene = source if isinstance(source, Scene) else load_scene(source, engine=engine)
+        key = None if start is None else key_of(scene.mj_model, start)
         outcome = named_cost(scene, cost) if isinstance(cost, str) else as_pytree(cost)
         started = time.perf_counter()
         try:
-            motions = patiently(lambda: random_motions(scene, rng))
+            motions = patiently(lambda: random_motions(scene, rng, key))
             stability = check_stability(scene, speed=motions.touch_speed or None)
         except KeyboardInterrupt:
             say(f"interrupted before anything was measured of\n\n{scene.summary()}")
@@ -209,7 +217,7 @@ def check(
         asked = time.perf_counter()
         if scene.model.nu and is_any_sound:
             say("timing gradients by C MuJoCo")
-            prices = patiently(lambda: seconds_of(scene))
+            prices = patiently(lambda: seconds_of(scene, key))
         if derivatives and is_any_sound:
             say("measuring derivatives by C MuJoCo")
             end = max(begun + budget, started + budget / 2) + time.perf_counter() - asked
@@ -229,7 +237,7 @@ def check(
         found += findings.measured_findings(measured) if measured else ()
         found += findings.left_out_findings(measured, None if was_interrupted else budget)
     seen = scene, motions, stability, measured, prices
-    of = path, cost if isinstance(cost, str) else None
+    of = path, cost if isinstance(cost, str) else None, start
     return finished(lambda: _verdict(*seen, [*found], names, of, None if was_interrupted else say))
 
 
@@ -241,10 +249,10 @@ def _verdict(
     prices: dict[str, float],
     found: list[Finding],
     names: tuple[str, ...],
-    of: tuple[str, str | None],
+    of: tuple[str, str | None, str | int | None],
     say: Callable[[str], None] | None,
 ) -> Verdict:
-    """Return what all findings amount to, of a file and the name of a cost; without `say` engines are not compared."""
+    """Return what all findings amount to, of a file, the name of a cost and a start; without `say` engines are not compared."""
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
@@ -272,6 +280,7 @@ def _verdict(
         motions=motions,
         measured=measured,
         seconds=prices,
+        start=of[-1],
     )
 
 
@@ -322,7 +331,9 @@ def _noise_text(noise: Noise) -> str:
     return f"Noise {noise.stddev:g}, {where}: {told}"
 
 
-def _setup(scene: Scene, advice: Recommendation, path: str, more: str = "", cost: str | None = None) -> str:
+def _setup(
+    scene: Scene, advice: Recommendation, path: str, start: str | int | None, more: str = "", cost: str | None = None
+) -> str:
     """Return the beginning of a program with the recommended settings, up to its start and its task."""
     yours, drive = "  # your file" * (not Path(path).exists()), " + 1e-3 * (trajectory.ctrl**2).mean()"
     costing = f"""\
@@ -344,34 +355,37 @@ import mjxgrad as mg
 {more}
 scene = mg.load_scene({path!r}{settings}){yours}
 {costing}\
-start = mg.initial_state(scene{_keyframe(scene)})
+start = mg.initial_state(scene{_keyframe(scene, start)})
 task = mg.SceneTask(scene, start, cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
 """
 
 
-def _keyframe(scene: Scene) -> str:
-    model = scene.mj_model
-    return f", keyframe={model.key(0).name or 0!r}" if model.nkey else ""
+def _key(scene: Scene, start: str | int | None) -> str:
+    """Return the key frame from which a program begins, by default the first."""
+    return repr((scene.mj_model.key(0).name or 0) if start is None else start)
 
 
-def _home(scene: Scene) -> str:
+def _keyframe(scene: Scene, start: str | int | None) -> str:
+    return f", keyframe={_key(scene, start)}" if scene.mj_model.nkey else ""
+
+
+def _home(scene: Scene, start: str | int | None) -> str:
     """Return the controls about which a program begins: the key frame's."""
-    model = scene.mj_model
-    return f"scene.mj_model.key({model.key(0).name or 0!r}).ctrl" if model.nkey else "jnp.zeros(scene.model.nu)"
+    return f"scene.mj_model.key({_key(scene, start)}).ctrl" if scene.mj_model.nkey else "jnp.zeros(scene.model.nu)"
 
 
-def _code(scene: Scene, advice: Recommendation, path: str, cost: str | None) -> str:
+def _code(scene: Scene, advice: Recommendation, path: str, cost: str | None, start: str | int | None) -> str:
     """Return the recommendation as a program."""
     stddev = (advice.stddev * half_range(scene)).round(6).tolist() if scene.model.nu else [advice.stddev]
     noise = f"{stddev[0]:g}" if len(set(stddev)) == 1 else f"jnp.array({stddev})"
     objective = f"mg.open_loop(task, stddev={noise})"
     if not scene.model.nu:
-        run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{_keyframe(scene)})).cost"
+        run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{_keyframe(scene, start)})).cost"
         objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise}, dim={scene.model.nv})"
     return f"""\
-{_setup(scene, advice, path, cost=cost)}\
+{_setup(scene, advice, path, start, cost=cost)}\
 objective = {objective}
-params = {f"jnp.tile({_home(scene)}, task.horizon)" if scene.model.nu else "jnp.zeros(objective.dim)"}
+params = {f"jnp.tile({_home(scene, start)}, task.horizon)" if scene.model.nu else "jnp.zeros(objective.dim)"}
 estimate = mg.estimators.{advice.estimator}(objective, params, jax.random.key(0), num_samples=32)
 """
 
@@ -389,8 +403,8 @@ def program(verdict: Verdict, path: str, video: str) -> tuple[str, float]:
     more = "import optax\n\nmg.keep_compiled()  # on disk, so that the next run starts at once"
     parts = {
         "name": repr(Path(path).name)[1:-1].replace('"', "'"),  # within a docstring
-        "setup": _setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, more),
-        "home": _home(verdict.scene),
+        "setup": _setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, verdict.start, more),
+        "home": _home(verdict.scene, verdict.start),
         "held": held,
         "num_knots": -(-horizon // held),
         "stddev": advice.stddev,

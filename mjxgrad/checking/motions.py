@@ -102,16 +102,17 @@ def smooth(rng: Generator, num_steps: int, num_columns: int, timestep: float) ->
     return scipy.interpolate.make_interp_spline(np.linspace(0, 1, len(knots)), knots, k=1)(np.linspace(0, 1, num_steps))
 
 
-def random_motions(scene: Scene, rng: Generator) -> Motions:
-    """Simulate a scene from its key frames and reference pose, under smooth random controls."""
+def random_motions(scene: Scene, rng: Generator, key: int | None = None) -> Motions:
+    """Simulate a scene under smooth random controls, from its key frames and reference pose, or from one about its controls."""
     model, timestep = scene.to_mujoco(), float(scene.model.opt.timestep)
     num_steps = int(np.clip(round(_SECONDS / timestep), _FEWEST_STEPS, _MOST_STEPS))
     low, high = np.asarray(scene.ctrlrange, float).T
     middle, half = np.where(np.isfinite(low + high), (low + high) / 2, 0.0), half_range(scene)
-    starts = list(_starts(scene, model))
+    starts = list(_starts(scene, model, key))
     chosen = [starts[i % len(starts)] for i in range(_NUM_MOTIONS)]
     wiggles = [smooth(rng, num_steps, model.nu, timestep) for _ in chosen]
-    controls = np.array([middle + _REACH * half * one for one in wiggles])
+    middle = middle if key is None else model.key_ctrl[key]
+    controls = np.array([np.clip(middle + _REACH * half * one, low, high) for one in wiggles])
     names, *parts = zip(*chosen, strict=True)
     start: _States = dict(zip(("qpos", "qvel", "act"), map(np.array, parts), strict=True))
     path, bad_steps = held(run(scene, start, controls))
@@ -124,12 +125,14 @@ def random_motions(scene: Scene, rng: Generator) -> Motions:
     return Motions(names, qpos, qvel, act, controls, timestep, bad_steps, onsets, touches, touching, idle, exact)
 
 
-def _starts(scene: Scene, model: mujoco.MjModel) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield name and state of the key frames, and of the reference pose if it is valid or the only one."""
-    for i in range(min(model.nkey, _NUM_MOTIONS - 1)):
+def _starts(
+    scene: Scene, model: mujoco.MjModel, key: int | None
+) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield name and state of one key frame, or of all, and of the reference pose if it is valid or the only one."""
+    for i in range(min(model.nkey, _NUM_MOTIONS - 1)) if key is None else [key]:
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or str(i)
         yield f"key frame {name}", model.key_qpos[i], model.key_qvel[i], model.key_act[i]
-    if not model.nkey or not any(pose_warnings(scene.model, model, model.qpos0)):
+    if key is None and (not model.nkey or not any(pose_warnings(scene.model, model, model.qpos0))):
         yield "the reference pose", model.qpos0, np.zeros(model.nv), np.zeros(model.na)
 
 
@@ -162,16 +165,18 @@ def run(
     return path if follow is None else path | {"change": found["change"]}
 
 
-def seconds_of(scene: Scene) -> dict[str, float]:
+def seconds_of(scene: Scene, key: int | None = None) -> dict[str, float]:
     """Return how long a step of a "motion" and of its gradients takes, by kind: in a batch by C MuJoCo, from the start."""
     model, pool = scene.mj_model, pool_of(scene.mj_model)
     num = 2 * pool.num_threads
-    _, *start = next(_starts(scene, scene.to_mujoco()))
+    _, *start = next(_starts(scene, scene.to_mujoco(), key))
     numbers = {name: np.asarray(value)[None] for name, value in changed_numbers(scene).items()}
     given = {name: np.tile(x, (num, 1)) for name, x in zip(("qpos", "qvel", "act"), start, strict=True)}
     given["time"] = np.zeros((num, 1))
-    # About those of the first key frame, or zero, within the actuators' ranges.
-    home = np.clip(model.key_ctrl[0] if model.nkey else np.zeros(model.nu), *np.asarray(scene.ctrlrange, float).T)
+    # About those of the key frame, by default the first, or zero, within the actuators' ranges.
+    home = np.clip(
+        model.key_ctrl[key or 0] if model.nkey else np.zeros(model.nu), *np.asarray(scene.ctrlrange, float).T
+    )
     controls = home + 0.1 * half_range(scene) * np.random.default_rng(0).normal(size=(num, _TIMED, model.nu))
     wanted = {"discrete": ("ctrl",), "slope": (*with_pairs(("ctrl",)), "flight")}
 

@@ -41,7 +41,7 @@ def initial_state(
     check_scene(scene)
     data, keys, parts = scene.data, {}, []
     if keyframe is not None:
-        key = _keyframe(scene.mj_model, keyframe)
+        key = key_of(scene.mj_model, keyframe)
         keys = {name: getattr(scene.mj_model, f"key_{name}")[key] for name in ("qpos", "qvel", "act")}
     for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
         template = getattr(data, name)
@@ -59,7 +59,8 @@ def initial_state(
     return engine_of(scene).complete(scene, state, Discrete())
 
 
-def _keyframe(model: mujoco.MjModel, keyframe: str | int) -> int:
+def key_of(model: mujoco.MjModel, keyframe: str | int) -> int:
+    """Return the index of a key frame; refuse one that is not there."""
     names = [model.key(i).name or i for i in range(model.nkey)]
     if keyframe in names:
         return names.index(keyframe)

@@ -137,6 +137,22 @@ def test_a_control_range_in_degrees_is_named(reach, expected):
     assert kinds(quick(scene)) & {"degrees"} == expected
 
 
+def test_a_start_that_was_asked_for_is_that_of_motions_and_of_the_code():
+    """Without it motions begin at both keys, and the code at the first."""
+    keys = "<keyframe><key name='far' qpos='3'/><key name='near' qpos='.1' ctrl='.9'/></keyframe></mujoco>"
+    scene = ball().replace("</mujoco>", keys)
+    verdict = mg.check(scene, start="near", derivatives=False)
+    assert set(verdict.motions.poses) == {"key frame near"}
+    np.testing.assert_array_equal(verdict.motions.qpos[:, 0], 0.1)
+    assert verdict.motions.controls.mean() > 0.4
+    assert verdict.motions.controls.max() <= 1
+    assert "keyframe='near'" in verdict.code
+    assert "key('near').ctrl" in program(verdict, "ball.xml", "ball.mp4")[0]
+    assert "keyframe='far'" in quick(scene).code
+    with pytest.raises(ValueError, match=r"keyframe must be one of \['far', 'near'\]"):
+        mg.check(scene, start="between")
+
+
 def test_contact_that_never_touches_is_named():
     """It falls for half a second, 1.2 of 40 m."""
     assert "floor – ball" in fault(quick(ball(height=40, gear=0.1)), "no_contact")
@@ -340,7 +356,7 @@ def test_an_interruption_keeps_what_was_measured(monkeypatch):
     monkeypatch.setattr("mjxgrad.checking.measure._Probe.noise", interrupted)
     own, order = measure, []
     module = importlib.import_module("mjxgrad.checking.check")
-    monkeypatch.setattr(module, "seconds_of", lambda scene: order.append("prices") or seconds_of(scene))
+    monkeypatch.setattr(module, "seconds_of", lambda *given: order.append("prices") or seconds_of(*given))
     monkeypatch.setattr(module, "measure", lambda *given, **how: order.append("derivatives") or own(*given, **how))
     measured = mg.check(ball(), budget=1000).measured
     assert order == ["prices", "derivatives"], "or Ctrl-C would wait for prices"
