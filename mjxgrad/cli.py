@@ -10,6 +10,7 @@ import os
 import shlex
 import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -43,6 +44,8 @@ app = cyclopts.App(
     suppress_keyboard_interrupt=False,
 )
 
+_SHOWN = threading.Event()  # set once a command has printed what it found
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
@@ -52,6 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     interruptions: list[float] = []
     COMES_AGAIN.clear()  # of the program that calls a command
+    _SHOWN.clear()
 
     def interrupt(*_: Any) -> None:
         if COMES_AGAIN.is_set():
@@ -78,7 +82,7 @@ def main(arguments: list[str] | None = None) -> int:
         if interruptions:  # the library has returned what was measured
             raise KeyboardInterrupt
     except KeyboardInterrupt:
-        _say("interrupted")
+        _say("interrupted" if _SHOWN.is_set() else "interrupted before there was anything to write")
         status = 130
         if arguments is None:  # as a command: nobody waits for work in other threads
             with contextlib.suppress(AttributeError, BrokenPipeError):  # a closed stdout
@@ -104,6 +108,8 @@ def _print(text: str, stream: Any) -> None:
     if stream is None:
         return
     try:
+        if stream is sys.stdout:
+            _SHOWN.set()
         print(text, file=stream, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

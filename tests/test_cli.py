@@ -164,7 +164,7 @@ def test_an_interruption_ends_in_one_line(scene, capsys, monkeypatch):
 
     monkeypatch.setattr(mg, "check", interrupted)
     assert cli.main(["check", scene]) == 130
-    assert capsys.readouterr().err.splitlines()[1:] == ["interrupted"]  # the first tells the price
+    assert capsys.readouterr().err.splitlines()[1:] == ["interrupted before there was anything to write"]
 
 
 _SWEEP = ["sweep", "scene.xml", "--samples", "64", "--horizon", "20", "--engine", "mujoco", "--stiffness", "1e3", "1e5"]

@@ -14,7 +14,7 @@ References:
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -253,6 +253,7 @@ class Regression:
     ):  # fmt: skip
         self._middle, self._count, self._width = drawn.mean(axis=0), len(drawn), 1 + drawn.shape[1] + free.shape[2]
         self._parts: list[_Part] = []
+        self._apart: np.ndarray | None = None
         for starts, one in zip(free.swapaxes(0, 1), residuals.swapaxes(0, 1), strict=True):
             away = np.column_stack([starts - starts.mean(axis=0), drawn - self._middle, np.ones(self._count)])
             inverse = np.linalg.pinv(away)
@@ -260,45 +261,50 @@ class Regression:
             left = one - away @ columns
             self._parts.append(_Part(columns, left, left @ left.T, inverse @ inverse.T))
 
-    def _weighed(self, noise: float, chatter: float) -> tuple[np.ndarray, list[_Product]]:
-        """Return what tells derivatives apart, and by window the product of all columns with others.
-
-        Products are weighed by the covariance of noise and chatter, the latter by a factor.
-        """
-        scale, dim = max(self._count - self._width, 1) * noise**2 / chatter, len(self._middle)
-        slope, error, found = np.zeros((dim, dim)), np.zeros((dim, dim)), list[_Product]()
-        for columns, left, gram, inverse in self._parts:
+    def _weighed(self, noise: float, chatter: float) -> Iterator[_Product]:
+        """Yield, by window, the product of all columns with others, weighed by the covariance of noise and chatter."""
+        scale = self._scale(noise, chatter)
+        for columns, left, gram, _ in self._parts:
             # (σ² + e e'/n)⁻¹ = (1 - e (n σ² + e'e)⁻¹ e') / σ², in the space of motions, which are fewer than numbers.
             least = max(scale, 1e-12 * np.trace(gram))
-            within = least * np.eye(self._count) + gram
-            kept, across = np.linalg.solve(within, left @ columns.T), np.linalg.inv(within)
-            product = columns @ columns.T - kept.T @ (left @ columns.T)
-            free = len(columns) - dim - 1
-            # What the starts explain tells nothing of the values; by these shares of theirs, errors of starts count, too.
-            shares = -np.linalg.pinv(product[:free, :free], hermitian=True) @ product[:free, free:-1]
-            shares = np.vstack([shares, np.eye(dim)])
-            slope += shares.T @ product[:-1, :-1] @ shares
-            # e_i' (n σ² + e'e - e_i e_i')⁻¹ e_i: each motion's chatter over the covariance of noise and that of the others, as
-            # that of the columns' errors is another one than what is left.
-            alone = 1.0 / np.maximum(least * np.diag(across), 1e-12) - 1.0
-            # Squares of as many errors as chatter has directions are rarely more than what is expected of them and this more.
-            part = np.eye(self._count) - least * across
-            spread = np.sqrt(2.0 * np.sum(part**2) / max(np.trace(part) ** 2, 1e-300))
-            most = noise**2 / chatter * alone.sum() * (1.0 + _BY_CHANCE * spread)
-            error += most * shares.T @ inverse[:-1, :-1] @ shares
-            found.append(
-                lambda others, columns=columns, left=left, kept=kept: columns @ others - kept.T @ (left @ others)
-            )
-        return distinct(slope, error), found
+            kept = np.linalg.solve(least * np.eye(self._count) + gram, left @ columns.T)
+            yield lambda others, columns=columns, left=left, kept=kept: columns @ others - kept.T @ (left @ others)
+
+    def _scale(self, noise: float, chatter: float) -> float:
+        return max(self._count - self._width, 1) * noise**2 / chatter
+
+    def _told(self, noise: float, chatter: float) -> Float[np.ndarray, "dim dim"]:
+        """Return what derivatives are multiplied with so that their own errors tell no numbers apart.
+
+        It depends little on the factor of chatter, and is found once.
+        """
+        dim = len(self._middle)
+        if self._apart is None and dim < 2:
+            self._apart = np.eye(dim)
+        if self._apart is None:
+            slope, error = np.zeros((dim, dim)), np.zeros((dim, dim))
+            for (columns, left, gram, inverse), product in zip(self._parts, self._weighed(noise, chatter), strict=True):
+                weighed, free = product(columns.T), len(columns) - dim - 1
+                # What the starts explain tells nothing of values; by these shares of theirs, errors of starts count, too.
+                shares = -np.linalg.pinv(weighed[:free, :free], hermitian=True) @ weighed[:free, free:-1]
+                shares = np.vstack([shares, np.eye(dim)])
+                slope += shares.T @ weighed[:-1, :-1] @ shares
+                expected, directions = _sum_of_others(
+                    left, gram, max(self._scale(noise, chatter), 1e-12 * np.trace(gram))
+                )
+                # Squares of as many errors are rarely more than what is expected of them by more than this.
+                most = 1.0 + _BY_CHANCE * np.sqrt(2.0 / directions)
+                error += noise**2 / chatter * expected * most * shares.T @ inverse[:-1, :-1] @ shares
+            self._apart = distinct(slope, error)
+        return self._apart
 
     def weighed(self, noise: float, chatter: float = 1.0) -> Float[np.ndarray, "windows columns columns"]:
         """Return factors of mean residual and derivatives over the root of the covariance, times the noise.
 
         The covariance is that of noise and chatter, the latter by a factor.
         """
-        apart, products = self._weighed(noise, chatter)
-        found = []
-        for (columns, *_), product in zip(self._parts, products, strict=True):
+        apart, found = self._told(noise, chatter), []
+        for (columns, *_), product in zip(self._parts, self._weighed(noise, chatter), strict=True):
             gram = product(columns.T)
             sizes = np.sqrt(np.where(np.diag(gram) > 0, np.diag(gram), 1.0))
             values, axes = np.linalg.eigh(gram / np.outer(sizes, sizes))
@@ -316,8 +322,10 @@ class Regression:
         """Return errors of the values that other motions would be given if they were recorded, in standard errors."""
         rng, dim = np.random.default_rng(1), drawn.shape[1]
         slope, seen = np.zeros((dim, dim)), np.zeros((dim, len(drawn)))
-        apart, products = self._weighed(noise, chatter)
-        for (columns, *_), product, one in zip(self._parts, products, residuals.swapaxes(0, 1), strict=True):
+        apart = self._told(noise, chatter)
+        for (columns, *_), product, one in zip(
+            self._parts, self._weighed(noise, chatter), residuals.swapaxes(0, 1), strict=True
+        ):
             free = len(columns) - dim - 1
             gram, told = product(columns.T), product((one + noise * rng.normal(size=one.shape) - columns[-1]).T)
             inner = gram[:-1, :free] @ np.linalg.pinv(gram[:free, :free], hermitian=True)
@@ -328,3 +336,20 @@ class Regression:
         is_told = (apart == np.eye(dim)).all(axis=1)
         sizes = np.sqrt(np.where(is_told, np.diag(inverse), 0.0))
         return ((inverse @ apart.T @ seen).T - (drawn - self._middle)) / np.where(sizes > 0, noise * sizes, np.inf)
+
+
+def _sum_of_others(left: np.ndarray, gram: np.ndarray, least: float) -> tuple[float, float]:
+    """Return the sum of squares of motions' chatter, each over the covariance of noise and the others', and its directions.
+
+    The errors of derivatives are of chatter that is another than what is left: by its own covariance it would seem smaller.
+    """
+    if left.shape[1] < len(left):
+        inner = np.linalg.solve(least * np.eye(left.shape[1]) + left.T @ left, left.T)
+        part, own = inner @ left, np.sum(left * inner.T, axis=1)
+    else:
+        part = np.eye(len(left)) - least * np.linalg.inv(least * np.eye(len(left)) + gram)
+        own = np.diag(part)
+    # e_i' (n σ² + e'e - e_i e_i')⁻¹ e_i = h / (1 - h), where h is the same with e_i.
+    own = np.clip(own, 0.0, 1.0 - 1e-12)
+    squares = float(np.sum(part * part.T))
+    return float(np.sum(own / (1.0 - own))), max(float(np.trace(part)) ** 2 / max(squares, 1e-300), 1.0)

@@ -163,7 +163,8 @@ def outlook(
     """Return what recordings can tell of parameters, and what a search would take, before `identify` with these arguments.
 
     The relative errors are those of a linear model at the nominal values, if the noise is as stated. Where contacts chatter, it
-    is that of the mean of 192 motions or more, as `identify` fits it; errors there can be several times larger or smaller.
+    is a model of the mean of 192 motions or more, as `identify` fits it; errors at the end can be several times larger or
+    smaller.
 
     Raises:
         ValueError: as `identify`.
@@ -182,13 +183,13 @@ def outlook(
         with contextlib.suppress(DivergedError):
             factors = search.mean(start.point)
     if not (is_mean := factors is not None):
-        narrow = tuple(np.minimum(one, other) for one, other in zip(widths, linear.widths, strict=True))
+        narrow = np.minimum(widths[0], linear.widths[0]), np.minimum(widths[1], linear.widths[1])
         linear = search.linear(start.point, residual, narrow, problem.num_steps, 1.0)
         factors = search.told(start.point, residual, linear)
     slope = _slope(problem, factors, coordinates.nominal)
     found = statistics(coordinates, coordinates.nominal, float(problem.num_numbers), slope, problem.num_numbers, 0)
     seconds = num * search.pace, more * search.pace
-    return Outlook(coordinates, found, *seconds, int(num), *problem.windows.controls.shape[:2], is_rugged, is_mean)
+    return Outlook(coordinates, found, *seconds, int(num), len(problem.sizes), problem.num_steps, is_rugged, is_mean)
 
 
 def _checked(
@@ -466,7 +467,7 @@ class _Search:
         problem, dim, factors = self.problem, self.problem.count, factors_of(residual, linear.slope, linear.by_start)
         if dim < 2:
             return factors
-        half = tuple(width / 2 for width in linear.used)
+        half = linear.used[0] / 2, linear.used[1] / 2
         finer = self.linear(point, residual, half, problem.num_steps, 1.0)
         apart = np.concatenate([linear.by_start - finer.by_start, linear.slope - finer.slope], axis=2)
         both = factors_of(residual, np.concatenate([linear.slope, apart], axis=2), linear.by_start)

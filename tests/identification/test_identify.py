@@ -405,7 +405,7 @@ def test_what_recordings_cannot_tell_is_said_before_a_search(cart):
 
 
 @pytest.mark.usefixtures("few_starts")
-@pytest.mark.parametrize(("floor", "noise"), [(False, 1e-4), (False, 1e-2), (True, 1e-4)])
+@pytest.mark.parametrize(("floor", "noise"), [(False, 1e-4), (False, 1e-3), (True, 1e-4)])
 def test_damping_and_the_servo_s_are_one_force_and_told_as_their_sum(floor, noise):
     """Secants of the two differ by their widths, and on a floor, where contacts chatter, by jumps: neither tells them apart.
 
@@ -422,7 +422,7 @@ def test_damping_and_the_servo_s_are_one_force_and_told_as_their_sum(floor, nois
         mg.initial_state(scene),
         controls,
     ).qpos
-    measured = np.asarray(places) + noise * np.random.default_rng(0).normal(size=places.shape)
+    measured = np.asarray(places) + noise * np.random.default_rng(1).normal(size=places.shape)
     recording = Recording({"qpos": measured}, controls, noise={"qpos": noise}, start=mg.initial_state(scene))
     parameters = {"damping": identification.damping(scene, "x"), "servo": identification.gains(scene, "servo")}
     before = identification.outlook(scene, parameters, [recording])
@@ -439,7 +439,7 @@ def test_damping_and_the_servo_s_are_one_force_and_told_as_their_sum(floor, nois
     assert np.isinf([result.half_width["damping"], result.half_width["servo"][1]]).all()
     stiffness, damping = result.values["servo"]
     assert abs(stiffness - 320) < result.half_width["servo"][0] < 2e4 * noise
-    np.testing.assert_allclose(result.values["damping"] + damping, 32.0, rtol=0.02 if noise < 1e-3 else 0.2)
+    np.testing.assert_allclose(result.values["damping"] + damping, 32.0, rtol=0.03)
 
 
 @pytest.mark.parametrize(

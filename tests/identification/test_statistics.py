@@ -61,7 +61,7 @@ def test_combinations_that_cannot_be_told_apart_are_named_with_their_shares():
 
 
 def test_what_undoes_a_small_number_is_named_where_it_is_large_itself():
-    """The sum alone is seen of 0.1 and 9: a per cent of the one is a ninetieth of that of the other."""
+    """The sum alone is seen of 0.1 and 9: a per cent of the one is a ninetieth of a per cent of the other."""
     rng = np.random.default_rng(5)
     slope = rng.normal(size=25)[:, None] * np.ones(2)
     (combination,) = _judge(slope, rng.normal(size=25), a=0.1, b=9.0).inseparable
