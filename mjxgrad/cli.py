@@ -189,7 +189,7 @@ def sweep(
             mix of the heaviest body's final coordinates.
         start: a key frame by name, with its controls, about which the noise is; by default the first, else the reference pose.
         horizon: number of time steps; by default half a second, but 50 to 300 steps.
-        stiffness: contact stiffnesses in 1/s², beside the file's own; 1e2 to 1e6 by default.
+        stiffness: contact stiffnesses in 1/s², beside the file's own; by default 1e2 to 1e6, as far as the time step allows.
         noise: standard deviation on each control of each step, in halves of its range; without any, on velocities.
         samples: rollouts of each estimate; the truth takes sixteen times as many, without derivatives. By default 256, and by C
             MuJoCo fewer where these take more than two minutes, at least 64.

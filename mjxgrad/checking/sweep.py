@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
@@ -20,9 +21,10 @@ from mjxgrad._text import Paged, aligned, duration, format_number, paced
 from mjxgrad.batched import device
 from mjxgrad.checking.check import Source, in_double, outcomes_of
 from mjxgrad.checking.costs import Cost, named_cost
-from mjxgrad.checking.findings import exact_text, percent
+from mjxgrad.checking.findings import chosen, exact_text, percent
 from mjxgrad.checking.motions import CONTACT_FIELDS, compiler_options, half_range, seconds_of, touching_exactly
 from mjxgrad.contact import Softness
+from mjxgrad.contact.warnings import largest_stable_step
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import BATCH, ESTIMATES
 from mjxgrad.engines import ENGINES, QUICK, engine_of
@@ -199,9 +201,16 @@ class Knob:
         return f"a constant added to the control of {which}, with noise of {self.noise:g} in each step; 1 is half its range"
 
 
-def nearer(knob: Knob, softness: Softness, key: PRNGKeyArray, truth: tuple[np.ndarray, np.ndarray]) -> tuple[Knob, str]:
+def nearer(
+    knob: Knob, softness: Softness, key: PRNGKeyArray, truth: tuple[np.ndarray, np.ndarray], say: Callable[[str], None]
+) -> tuple[Knob, str]:
     """Return the knob with the derivative that errs less, and why, where that is not the slope."""
-    slope, discrete = (knob.error(contact, softness, key, truth) for contact in (Slope(), Discrete()))
+
+    def error(contact: Slope | Discrete) -> float:
+        say(f"{BATCH} gradients by {chosen(contact.gradient)}, to see which derivative errs less")
+        return knob.error(contact, softness, key, truth)
+
+    slope, discrete = error(Slope()), error(Discrete())
     if discrete >= _NEARER * slope:
         return knob, ""
     other = dataclasses.replace(knob, task=knob.task.with_contact(Discrete()))
@@ -328,7 +337,7 @@ def sweep(
     source: Source,
     cost: str | Cost | None = None,
     *,
-    stiffness: Sequence[float] = STIFFNESS,
+    stiffness: Sequence[float] | None = None,
     noise: float = 0.1,
     num_samples: int | None = None,
     num_reference: int | None = None,
@@ -347,7 +356,8 @@ def sweep(
         cost: function of a trajectory; or file.py:function, module:function; or a cost of bodies and sites at the end,
             height:torso (minus its height, m), speed:torso (minus its mean speed along x, m/s), upright:torso (1 − cosine of
             its tilt), reach:hand/ball (their distance, m). None is a random mix of the heaviest body's final coordinates.
-        stiffness: stiffnesses to sweep (1/s²), besides the file's own.
+        stiffness: stiffnesses to sweep (1/s²), besides the file's own; by default 1e2 to 1e6, as far as the time step integrates
+            them.
         noise: standard deviation on each control of each step, in halves of its range; without controls, on velocities.
         num_samples: rollouts per estimate; by default 256, fewer by C MuJoCo where these take more than two minutes, at least 64.
         num_reference: rollouts for the truth, without derivatives; by default sixteen times as many.
@@ -365,7 +375,7 @@ def sweep(
         ValueError: if there is no such file, function, body or key frame, a number is out of range, or nothing that the controls
             move reaches the cost.
     """
-    given = np.atleast_1d(np.asarray(real("stiffness", stiffness), float))
+    given = np.atleast_1d(np.asarray(real("stiffness", STIFFNESS if stiffness is None else stiffness), float))
     if not ((given > 0) & (given < np.inf)).all():
         raise ValueError(f"stiffness must be positive and finite, got {', '.join(map(str, given))}")
     if not 0 < real("noise", noise) < np.inf:
@@ -386,10 +396,18 @@ def sweep(
     task = scene_task(
         scene, cost, start=start, horizon=horizon, contact=Slope() if contact is None else contact, seed=seed
     )
+    left_out = []
+    if stiffness is None and scene.pairs:
+        integrator = mujoco.mjtIntegrator(scene.mj_model.opt.integrator)
+        limit = (largest_stable_step(1.0, integrator) / float(scene.model.opt.timestep)) ** 2
+        given, too_stiff = given[given < limit], given[given >= limit]
+        if too_stiff.size:
+            listed, told = " and ".join(map(format_number, too_stiff.tolist())), format_number(limit)
+            left_out.append(f"Left out: {listed} 1/s², for the time step integrates none from {told} on.")
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
-    say("moving from the start under noise, to see which derivative errs less and what it takes")
+    say("moving from the start under noise")
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     why = ""
@@ -401,7 +419,7 @@ def sweep(
             stays = f"stays {at_rest:.3g} in {_PAIRS} motions under the noise"
             raise ValueError(f"cost must feel the controls, but {stays}: {wanted}")
         if is_free and scene.pairs:
-            knob, why = nearer(knob, softness, jax.random.key(seed + 1), few)
+            knob, why = nearer(knob, softness, jax.random.key(seed + 1), few, say)
             task = knob.task
     by, price = engine_of(scene, task.contact), {}
     if task.num_controls:
@@ -443,6 +461,7 @@ def sweep(
     told = [
         f"Gradient of {called} after {task.horizon} steps, by {knob}.",
         "Swept contacts are critically damped." if scene.pairs else none,
+        *left_out,
         f"Derivative: {kind}, by {engine_of(task.scene, contact).title}{why}.",
     ]
     if exact := touching_exactly(scene, np.asarray(task.state.qpos)):

@@ -74,7 +74,7 @@ def test_the_derivative_is_the_slope_unless_that_errs_twice_as_much(folder):
     for task, expected in ((hit, mg.Slope), (slide, mg.Discrete)):
         knob = Knob(task, 0.5)
         softness = mg.Softness(stiffness=jnp.asarray(knob.own))
-        chosen, why = nearer(knob, softness, jax.random.key(1), knob.truth(softness, jax.random.key(0), 256))
+        chosen, why = nearer(knob, softness, jax.random.key(1), knob.truth(softness, jax.random.key(0), 256), print)
         assert isinstance(chosen.task.contact, expected)
         assert why.startswith("; slopes of the outcome err") is (expected is mg.Discrete)
 
@@ -286,6 +286,16 @@ def test_a_cost_that_feels_nothing_is_refused_before_the_sweep(folder):
     """A block on a rail has one height; its page would have a zero in every cell, after minutes."""
     with pytest.raises(ValueError, match="cost must feel the controls, but stays -0 in 256 motions"):
         mg.sweep(folder / "block.xml", "height:block", horizon=20, engine="mujoco", contact=mg.Discrete())
+
+
+def test_stiffness_that_the_time_step_does_not_hold_is_left_out_unless_asked_for(folder):
+    """At 2 ms and critical damping those from (0.828/h)² = 171573 on: h²k + 2hb = 4, and b = 2√k."""
+    cost = f"{folder}/costs.py:reward"
+    sizes = {"start": "near", "horizon": 20, "num_samples": 8, "num_reference": 16, "engine": "mujoco"}
+    found = mg.sweep(folder / "block.xml", cost, contact=mg.Discrete(), **sizes)
+    assert found.labels == ["100", "1000", "2500 (file)", "10000", "1e5"]
+    assert not any(found.result.too_stiff)
+    assert "Left out: 1e6 1/s², for the time step integrates none from 1.72e5 on." in found.question
 
 
 def test_a_sweep_in_single_precision_is_that_in_double(folder):
