@@ -23,6 +23,7 @@ from mjxgrad.planning.trajectory import FREE, NO_COST, Course, Problem, deviatio
 from mjxgrad.rollouts import State
 
 _SAMPLES = 16  # random changes of a plan, for 15 % of a decision's time where a finger pushes a box
+_FIRST = 10  # iterations of the first decision, and more where the others take more
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
 _RECENT, _QUANTILE = 20, 0.9  # a part is expected to take what so large a share of its last times stays below
 _SHARE = 0.25  # of a deadline that linear models may take between two looks at the clock
@@ -74,7 +75,8 @@ class Controller(Printed):
             controls: initial controls of the first decision, one row per step.
             smoother: the smoother of the linear models at factor 1; its noise is the same in all decisions.
             schedule: factors of the smoothing in each decision, one per iteration.
-            first_schedule: the same for the first decision, which has no deadline; None takes `schedule`.
+            first_schedule: the same for the first decision, which has no deadline; None takes ten iterations at the first
+                factor of `schedule`, then its others. A plan that has not converged is never caught up with.
             num_samples: plans with random changes that are tried beside the step lengths, see `optimise_trajectory`: they reach
                 contacts that derivatives do not see, and get past where a push turns a body. None takes 16, and none with a
                 smoother such as `Sampled`, whose steps are many. Where an iteration is spread over decisions, they are tried in
@@ -95,10 +97,12 @@ class Controller(Printed):
             raise ValueError(f"deadline must be positive, in seconds, or None, got {deadline}")
         usual = _SAMPLES if isinstance(smoother, Analytic) else 0
         self.num_samples = whole("num_samples", usual if num_samples is None else num_samples, 0)
-        both = [schedule if first_schedule is None else first_schedule, schedule]
+        both = [schedule, *([] if first_schedule is None else [first_schedule])]
         given = system, cost, None, controls, jax.random.key(0), smoother, both, lower, upper
         problem, _, start, factors = posed(*given)
-        self._schedules, self._origin = [np.asarray(one) for one in factors], np.asarray(system.origin)
+        usual, *others = [np.asarray(one) for one in factors]
+        first = others[0] if others else np.concatenate([np.repeat(usual[:1], _FIRST - 1), usual])
+        self._schedules, self._origin = (first, usual), np.asarray(system.origin)
         self.stddev = deviations(stddev, problem)
         self.system, self._cost, self.deadline = system, cost, deadline
         self._iteration = self._prepared(problem, start)

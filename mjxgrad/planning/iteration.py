@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -73,7 +74,13 @@ class Iteration:
         began, problem = time.perf_counter(), self._problem
         rest = eqx.partition(self._cost, eqx.is_inexact_array_like)[1]
         of = lambda numbers: dataclasses.replace(problem, cost=eqx.combine(numbers, rest))  # noqa: E731
-        linearised = lambda numbers, search, factor, _, begin, *__: of(numbers).linearised(search, factor, begin, count)  # noqa: E731
+
+        def linearised(numbers: Any, search: Search, factor: Array, _: Array, begin: Array, *__: Any) -> Search:
+            # Of a plan that was shifted, at the first piece of an iteration: all pieces are to belong to one motion.
+            is_new = (begin == self.horizon - count) & ~jnp.isfinite(search.course.cost)
+            search = jax.lax.cond(is_new, lambda: of(numbers).followed(search, factor), lambda: search)
+            return of(numbers).linearised(search, factor, begin, count)
+
         solved = lambda numbers, search, *_: of(numbers).solved(search)  # noqa: E731
         chosen = lambda numbers, search, _, after, __, *given: of(numbers).chosen(search, after, *given)[0]  # noqa: E731
         functions, given = dict(zip(PARTS, (linearised, solved, chosen), strict=True)), self._given(LAST)

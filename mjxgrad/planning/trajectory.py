@@ -196,6 +196,16 @@ class Problem(eqx.Module):
         cost = self.cost.total(self.system, states, controls)
         return Course(states, controls, jnp.where(jnp.isfinite(cost), cost, jnp.inf))
 
+    def followed(self, search: Search, factor: _Scalar) -> Search:
+        """Return the search about the motion from where its course begins, by the last law; as it is where that diverges.
+
+        A course that was shifted to another state is no motion, and linear models along it promise what no step keeps.
+        """
+        law = dataclasses.replace(search.law, change=jnp.zeros_like(search.law.change))
+        course = self.run(self.smoother.scaled(factor), search.course, law, 1.0)
+        kept = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(course.cost), new, old), course, search.course)
+        return dataclasses.replace(search, course=kept)
+
     def linearised(self, search: Search, factor: _Scalar, begin: ArrayLike = 0, count: int | None = None) -> Search:
         """Take the linear models of all steps of the course, or of so many from one on."""
         course, linear_model = search.course, functools.partial(self.smoother.scaled(factor).linear_model, self.system)
@@ -226,7 +236,7 @@ class Problem(eqx.Module):
         came = tried.cost[0] - jnp.min(tried.cost[: 1 + len(_STEPS)])
         is_random = jnp.arange(len(steps)) > len(_STEPS)
         # A random change may cost less than a full step of a model that holds, but is a step towards nothing.
-        keeps = law.is_sound & (came >= _TRUSTED * law.promised)
+        keeps = law.is_sound & (came >= jnp.maximum(_TRUSTED * law.promised, _TOLERANCE * jnp.abs(tried.cost[0])))
         is_valid = (jnp.arange(len(steps)) == 0) | (~is_first & jnp.where(is_random, ~keeps, law.is_sound))
         index = jnp.argmin(jnp.where(is_valid, tried.cost, jnp.inf))
         course = jax.tree.map(lambda x: x[index], tried)

@@ -49,7 +49,7 @@ def start_of(system):
 def controller_of(system):
     goal = jax.jit(system.retract)(system.origin, 0.3 * jnp.ones(system.num_changes).at[2:5].set(0.0))
     cost, given = GoalCost(goal, 1.0, 10.0, 0.01), jnp.zeros((HORIZON, 2))
-    return Controller(system, cost, given, schedule=[1.0, 1.0], num_samples=0)
+    return Controller(system, cost, given, schedule=[1.0, 1.0], first_schedule=[1.0, 1.0], num_samples=0)
 
 
 def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):
@@ -65,7 +65,7 @@ def test_a_plan_is_to_the_bit_the_rollout_of_its_controls(system):
 
 @pytest.mark.parametrize("error", ["double"], indirect=True)
 def test_an_iteration_asks_c_mujoco_a_few_times(monkeypatch, system):
-    """Twice for all linear models, once for all step lengths; a decision begins with its plan's motion."""
+    """Twice for all linear models, twice for all step lengths, once for the motion of the plan with which a decision begins."""
     counts = collections.Counter()
     for name in ("steer", "product", "follow"):
         monkeypatch.setattr(Pool, name, _counted(counts, name))
@@ -73,7 +73,7 @@ def test_an_iteration_asks_c_mujoco_a_few_times(monkeypatch, system):
     controller(state)
     counts.clear()
     controller(state)
-    assert counts == {"steer": 2, "product": 2}
+    assert counts == {"steer": 3, "product": 2}
 
 
 def _counted(counts, name):

@@ -44,7 +44,7 @@ def system():
 
 @pytest.fixture(scope="module")
 def made(system):
-    return Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)), num_samples=0)
+    return Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)), first_schedule=[1.0], num_samples=0)
 
 
 @pytest.fixture
@@ -58,7 +58,8 @@ def controller(made):
 def test_boxes_are_pushed_to_their_goal_and_stay(system):
     """From 11 to 15 cm away. A push beside the middle turns a box, and rounding decides how far: so the median is judged.
 
-    With random changes of plans the median was 1.0 to 2.4 cm in eight runs and the worst 8, without them 2.4 to 4.4 and 22.
+    The median was 4 to 7 mm in four runs and the worst 16 mm, without random changes of plans 7 to 16 mm and 9 cm; 2 to 4 cm where
+    linear models were taken along plans that are no motion.
     """
     controller = Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)))
     model, found = mujoco.MjModel.from_xml_string(PUSHER), []
@@ -71,7 +72,7 @@ def test_boxes_are_pushed_to_their_goal_and_stay(system):
             mujoco.mj_step(model, data, SUBSTEPS)
             if k >= 40:
                 found.append(np.linalg.norm(data.qpos[2:4] - GOAL))
-    assert np.median(found) < 0.035
+    assert np.median(found) < 0.015
 
 
 def test_where_nothing_is_touched_a_warning_says_what_to_do(controller, system):
@@ -93,21 +94,23 @@ def test_a_deadline_is_kept_where_an_iteration_takes_longer(controller, system, 
 
         return run
 
-    start, costs = np.asarray(system.origin), []
+    model, costs = mujoco.MjModel.from_xml_string(PUSHER), []
+    data = mujoco.MjData(model)
     monkeypatch.setattr("mjxgrad.planning.controller.time", SimpleNamespace(perf_counter=lambda: now[0]))
     iteration = controller._iteration
     monkeypatch.setattr(iteration, "programs", {name: slow(one) for name, one in iteration.programs.items()})
-    controller(start)
+    controller(data)
     controller.deadline = 0.28
     for _ in range(12):
-        controller(start)
+        data.ctrl[:] = controller(data)
+        mujoco.mj_step(model, data, SUBSTEPS)
         costs.append(controller.plan.cost)
     assert controller.num_missed == 0
     assert controller.num_cut >= 4
     assert "13 decisions" in str(controller)
     finite = np.array(costs)[np.isfinite(costs)]
     assert 3 < len(finite) < 10
-    assert finite[-1] < 0.9 * finite[0]
+    assert finite[-1] < 0.5 * finite[0]
 
 
 def test_what_a_decision_takes_is_said_before_the_first(controller):
