@@ -58,8 +58,8 @@ def controller(made):
 def test_boxes_are_pushed_to_their_goal_and_stay(system):
     """From 11 to 15 cm away. A push beside the middle turns a box, and rounding decides how far: so the median is judged.
 
-    The median was 4 to 7 mm in four runs and the worst 16 mm, without random changes of plans 7 to 16 mm and 9 cm; 2 to 4 cm where
-    linear models were taken along plans that are no motion.
+    The median was 4 to 7 mm in four runs and the worst 16 mm; without random changes of plans 7 to 16 mm and 9 cm; 2 to 4 cm
+    where linear models were taken along plans that are no motion.
     """
     controller = Controller(system, Push(jnp.asarray(1.0)), jnp.zeros((10, 2)))
     model, found = mujoco.MjModel.from_xml_string(PUSHER), []
