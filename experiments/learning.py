@@ -18,7 +18,8 @@ from experiments import ppo
 from experiments.problems.gymnasium_v5 import gymnasium_returns
 from experiments.problems.humanoid import pushed_humanoid
 from experiments.problems.pusher import pusher
-from experiments.problems.quadruped import quadruped
+from experiments.problems.quadruped import go1_joystick, quadruped
+from experiments.problems.tracking import tracking
 from experiments.problems.trot import apg, trot
 from experiments.report import MOST_WORDS, Table
 from experiments.settings import Positive, SettingsTable, SizedSettings, VideoSettings
@@ -42,15 +43,17 @@ NAMES = {
 }
 _COLOURS = dict(zip(NAMES, (FIRST, "#8c6d31", "#56b4e9", "#cc79a7", ONSET, ZEROTH, "#777777"), strict=True))
 Name = Literal[
-    "cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "trot", "pushed_humanoid",
-    "hopper_v5", "walker2d_v5", "half_cheetah_v5", "ant_v5", "humanoid_v5",
+    "cartpole", "hopper", "half_cheetah", "ant", "humanoid", "pusher", "quadruped", "go1", "trot", "pushed_humanoid",
+    "tracking", "hopper_v5", "walker2d_v5", "half_cheetah_v5", "ant_v5", "humanoid_v5",
 ]  # fmt: skip
 _OURS: dict[str, Callable[..., Environment]] = {
-    "pusher": pusher, "quadruped": quadruped, "trot": trot, "pushed_humanoid": pushed_humanoid,
+    "pusher": pusher, "quadruped": quadruped, "go1": go1_joystick, "trot": trot, "pushed_humanoid": pushed_humanoid,
+    "tracking": tracking,
     **{name: envs.ENVIRONMENTS[name.removesuffix("_v5")] for name in get_args(Name) if name.endswith("_v5")},
 }  # fmt: skip
 _LOADERS = {name: _OURS.get(name) or getattr(envs.diffrl, name) for name in get_args(Name)}
 _OWN_STEPS = ("cartpole", *_OURS)  # whose time steps are their own
+_COMMANDED = ("quadruped", "go1")
 _SHOWN = 8.0  # s of an episode
 _LOADED = 400 / (35 * 9.81)  # weights of a robot above which BCG bundles: 400 N of a humanoid of 35 kg
 _FINER = 8  # times, by which time steps are shorter where a policy is judged a second time
@@ -70,8 +73,8 @@ class Sizes(SettingsTable):
 class Settings(SizedSettings):
     """Policies learned by several gradients from the same starts, and judged in C MuJoCo."""
 
-    # What is learned: DiffRL's tasks, a pusher, a quadruped that follows commands, MuJoCo's trot, a humanoid that is pushed, or
-    # gymnasium's robots, in which policies are then judged, too.
+    # What is learned: DiffRL's tasks, a pusher, a quadruped or Go1 that follows commands, MuJoCo's trot, a humanoid that is
+    # pushed or tracks motions, or gymnasium's robots, in which policies are then judged, too.
     environment: Name
     engine: EngineName = "mjx"  # who steps while learning
     # SHAC, or analytic policy gradients as in brax: no value function, other networks and rates.
@@ -205,7 +208,7 @@ def measure(settings: Settings, workspace: Workspace) -> Outcome:
     if "ppo" in settings.methods:
         ppo.load()  # or say at once that it is not there
     given: dict[str, Any] = {} if settings.num_substeps is None else {"num_substeps": settings.num_substeps}
-    if settings.environment == "pushed_humanoid":  # whose file MJX would convert
+    if settings.environment in ("pushed_humanoid", "tracking"):  # whose file MJX would convert
         given["engine"] = settings.engine
     environment = _LOADERS[settings.environment](**given).with_engine(settings.engine)
     settings = settings.counted(environment)
@@ -375,7 +378,7 @@ def answer(outcome: Outcome) -> str:
         earn = "still earn" + "s" * (len(kept) == 1)
         return f"With contact {stiff:g} times as stiff, {named(kept, len(methods), words=5)} {earn} half."
     best = outcome.best
-    if outcome.settings.environment == "quadruped":
+    if outcome.settings.environment in _COMMANDED:
         speed, turning = (quantity(off.mean()) for off in _off_command(best))
         return f"{capitalised(NAMES[best.method])} is off its command by {speed} m/s and {turning} rad/s."
     worth, num_updates = quantity(best.judged.mean()), outcome.settings.sizes.num_updates
@@ -431,7 +434,7 @@ def findings(outcome: Outcome) -> list[str]:
         sentences.append(
             f"Gradients of two halves of the environments agree by a cosine of {joined(each)}; where it is near 0, take more."
         )
-    if outcome.settings.environment == "quadruped":
+    if outcome.settings.environment in _COMMANDED:
         each = []
         for course in outcome.courses:
             speed, turning = (quantity(off.mean(), _spread(off)) for off in _off_command(course))

@@ -15,7 +15,8 @@ from mjxgrad.envs import Environment
 
 _READINGS = 20
 # Brax's own numbers for its half_cheetah with a longer discount, with which ants learn three times as much as with its ant's;
-# hoppers' and walkers' are those of MuJoCo Playground for dm_control, quadrupeds' those for its Go1.
+# hoppers' and walkers' are those of MuJoCo Playground for dm_control, quadrupeds' and the tracking humanoid's those for its
+# Go1 and G1.
 _HOW = {
     "num_envs": 2048,
     "unroll_length": 20,
@@ -35,8 +36,9 @@ _OWN: dict[str, dict[str, Any]] = {
     "quadruped": {"num_envs": 8192, "batch_size": 256, "num_updates_per_batch": 4, "discounting": 0.97}
     | {"entropy_cost": 1e-2, "max_grad_norm": 1.0},
 }
-_OWN["walker2d"] = _OWN["hopper"]
-_LAYERS = {"quadruped": dict.fromkeys(["policy_hidden_layer_sizes", "value_hidden_layer_sizes"], (512, 256, 128))}
+_OWN |= {"walker2d": _OWN["hopper"], "go1": _OWN["quadruped"], "tracking": _OWN["quadruped"] | {"entropy_cost": 5e-3}}
+_WIDE = dict.fromkeys(["policy_hidden_layer_sizes", "value_hidden_layer_sizes"], (512, 256, 128))
+_LAYERS = {"quadruped": _WIDE, "go1": _WIDE, "tracking": _WIDE}
 
 Act = Callable[[Any, Float[Array, " obs"]], Float[Array, " nu"]]
 """From what was learned and what is seen to an action."""

@@ -7,10 +7,12 @@ References:
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from experiments.problems.mjlab import go1
 from mjxgrad.bodies.spatial import rotation_matrix
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
@@ -23,13 +25,14 @@ _CHANGE = 0.004  # chance per action of a new command: after 5 s on average
 _PUSH = 1.0  # m/s, at most along either axis
 _PUSHED = 0.005  # chance per action of a push: after 4 s on average
 _REACH = 0.5  # rad that an action of 1 moves a joint's target
-_HEIGHT = 0.3  # m, of the trunk
-_LOWEST = 0.18
+_LOWEST = 0.6  # of the trunk's height, below which it has fallen
 _ALIVE = 4.0  # without it an early policy would be charged least for falling at once
 
 
 class Quadruped(Environment):
     """A quadruped with twelve position servos, 50 actions a second; on average a new command every 5 s, a push every 4 s."""
+
+    height: float = eqx.field(static=True, default=0.3, kw_only=True)  # m, at which the trunk is to be
 
     def start(self, key: PRNGKeyArray) -> State:
         joints, speeds = jax.random.split(key)
@@ -69,7 +72,7 @@ class Quadruped(Environment):
         return {
             "speed": -((speed[:2] - command[:2]) ** 2).sum(),
             "turning": -((turning[2] - command[2]) ** 2),
-            "height": jnp.exp(-10 * (after.qpos[2] - _HEIGHT) ** 2),
+            "height": jnp.exp(-10 * (after.qpos[2] - self.height) ** 2),
             "bouncing": -0.5 * speed[2] ** 2,
             "upright": -0.5 * down[2],
             "rocking": -0.05 * (turning[:2] ** 2).sum(),
@@ -80,13 +83,19 @@ class Quadruped(Environment):
         }
 
     def is_over(self, state: State) -> Bool[Array, ""]:
-        return (state.qpos[2] < _LOWEST) | (in_trunk(state)[0][2] > -0.3)
+        return (state.qpos[2] < _LOWEST * self.height) | (in_trunk(state)[0][2] > -0.3)
 
 
 def quadruped() -> Quadruped:
     """Return the task on a robot of 12 kg, each copy another one; a time step is 4 ms, an action holds for five."""
     scene = load_scene(scene_path("quadruped"), timestep=0.004, max_contacts=8)
     return Quadruped(scene, frame_skip=5, randomisation=spread)
+
+
+def go1_joystick() -> Quadruped:
+    """Return the same task on mjlab's Unitree Go1, of 12.7 kg."""
+    scene = load_scene(go1(), max_contacts=8)
+    return Quadruped(scene, frame_skip=5, randomisation=spread, height=0.28)
 
 
 def spread(key: PRNGKeyArray, scene: Scene) -> Scene:
