@@ -28,6 +28,7 @@ from mjxgrad.contact.warnings import largest_stable_step
 from mjxgrad.diagnostics import BiasVariance, bias_variance
 from mjxgrad.diagnostics.bias_variance import BATCH, ESTIMATES
 from mjxgrad.engines import ENGINES, QUICK, engine_of
+from mjxgrad.engines.engine import Engine
 from mjxgrad.estimators import first_order
 from mjxgrad.objective import Objective, parameter_noise
 from mjxgrad.objective.actions import OpenLoop
@@ -385,25 +386,17 @@ def sweep(
         whole("num_samples", num_samples, 2)
     function("log", log, "text")
     instance("progress", progress, bool, "True or False")
-    say, began, last = log or (paced("sweep") if progress else lambda _: None), [], [0]
+    say = log or (paced("sweep") if progress else lambda _: None)
     is_own = isinstance(contact, Slope | Discrete | None)
     quick = QUICK if is_own and device.is_cpu() else None
     scene = source if isinstance(source, Scene) else load_scene(source, engine=engine or quick)
     scene = scene if engine is None else scene.with_engine(engine)
     if start is None and scene.mj_model.nkey:
         start = scene.mj_model.key(0).name or 0
-    is_free = contact is None
     task = scene_task(
         scene, cost, start=start, horizon=horizon, contact=Slope() if contact is None else contact, seed=seed
     )
-    left_out = []
-    if stiffness is None and scene.pairs:
-        integrator = mujoco.mjtIntegrator(scene.mj_model.opt.integrator)
-        limit = (largest_stable_step(1.0, integrator) / float(scene.model.opt.timestep)) ** 2
-        given, too_stiff = given[given < limit], given[given >= limit]
-        if too_stiff.size:
-            listed, told = " and ".join(map(format_number, too_stiff.tolist())), format_number(limit)
-            left_out.append(f"Left out: {listed} 1/s², for the time step integrates none from {told} on.")
+    given, notes = _integrable(scene, given) if stiffness is None and scene.pairs else (given, [])
     own = jnp.broadcast_to(task.scene.data.ctrl, (task.horizon, task.num_controls))
     if not np.isfinite(at_rest := _by_mujoco(task).run(own).cost):
         raise ValueError(f"cost must be finite, got {at_rest} of the motion without noise")
@@ -411,28 +404,111 @@ def sweep(
     knob = Knob(task, noise, seed)
     swept = sorted({*given.tolist(), knob.own}) if scene.pairs else [1.0]
     why = ""
-    if task.num_controls and isinstance(task.contact, Slope | Discrete):
+    if task.num_controls and is_own:
         softness = Softness(stiffness=jnp.asarray(knob.own or swept[0]))
-        few = knob.truth(softness, jax.random.key(seed), _PAIRS)
-        if np.abs(few).max() <= _UNFELT * abs(at_rest):
-            wanted = "start nearer, at another key frame, or look further ahead, over a longer horizon"
-            stays = f"stays {at_rest:.3g} in {_PAIRS} motions under the noise"
-            raise ValueError(f"cost must feel the controls, but {stays}: {wanted}")
-        if is_free and scene.pairs:
+        few = _first_look(knob, softness, float(at_rest), say)
+        if contact is None and scene.pairs:
             knob, why = nearer(knob, softness, jax.random.key(seed + 1), few, say)
-            task = knob.task
-    by, price = engine_of(scene, task.contact), {}
-    if task.num_controls:
-        price = {kind: task.horizon * seconds for kind, seconds in seconds_of(scene).items()}
-        price["gradient"] = price[getattr(task.contact, "gradient", "slope")]
-    if num_samples is None:
-        each = (
-            len(swept) * (price["gradient"] + _REFERENCE * price["motion"]) if price and by is ENGINES[QUICK] else 0.0
-        )
-        num_samples = int(np.clip(BATCH * (_LONGEST // max(BATCH * each, 1e-9)), _FEWEST, _MOST))
+    task, prices = knob.task, _Prices.of(knob.task)
+    num_samples = num_samples or prices.affordable(len(swept))
     num_reference = _REFERENCE * num_samples if num_reference is None else num_reference
-    given = {"softness": Softness(stiffness=swept), "num_samples": num_samples, "num_reference": num_reference}
-    given |= {"reference": knob.truth if task.num_controls else None, "compiler_options": compiler_options()}
+    say(prices.foretold(len(swept), num_samples, num_reference, task.horizon))
+    if why:
+        say(f"derivatives are those of each step{why}")
+    result = bias_variance(
+        knob,
+        jnp.zeros((1, 1)),
+        jax.random.key(seed),
+        softness=Softness(stiffness=swept),
+        num_samples=num_samples,
+        num_reference=num_reference,
+        reference=knob.truth if task.num_controls else None,
+        compiler_options=compiler_options(),
+        progress=_advances(say),
+    )
+    called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
+    if not np.isfinite(result.table()["truth"]).any():
+        raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
+    told = f"Gradient of {called} after {task.horizon} steps, by {knob}."
+    return Sweep(scene.name, " ".join([told, *_measured(task, swept, notes, why, result)]), knob.own, result)
+
+
+def _integrable(scene: Scene, given: Float[np.ndarray, " softness"]) -> tuple[Float[np.ndarray, " kept"], list[str]]:
+    """Return the stiffnesses that a scene's time step integrates, and a sentence on the others, if there are any."""
+    integrator = mujoco.mjtIntegrator(scene.mj_model.opt.integrator)
+    limit = (largest_stable_step(1.0, integrator) / float(scene.model.opt.timestep)) ** 2
+    if not (too_stiff := given[given >= limit]).size:
+        return given, []
+    listed, told = " and ".join(map(format_number, too_stiff.tolist())), format_number(limit)
+    return given[given < limit], [f"Left out: {listed} 1/s², for the time step integrates none from {told} on."]
+
+
+def _first_look(
+    knob: Knob, softness: Softness, at_rest: float, say: Callable[[str], None]
+) -> tuple[Float[np.ndarray, "1 1"], Float[np.ndarray, "1 1"]]:
+    """Return the gradient and its error by few motions, and say so where that does not tell it from zero.
+
+    Raises:
+        ValueError: if the cost does not feel the controls.
+    """
+    few, error = knob.truth(softness, jax.random.key(knob.seed), _PAIRS)
+    if np.abs([few, error]).max() <= _UNFELT * abs(at_rest):
+        wanted = "start nearer, at another key frame, or look further ahead, over a longer horizon"
+        stays = f"stays {at_rest:.3g} in {_PAIRS} motions under the noise"
+        raise ValueError(f"cost must feel the controls, but {stays}: {wanted}")
+    value, half = few.item(), 2 * error.item()
+    if abs(value) < half:
+        untold = f"the gradient is {value:.2g} ± {half:.2g} by {_PAIRS} motions, not told from zero"
+        say(f"{untold}; if it stays so, start nearer or look further ahead")
+    return few, error
+
+
+@dataclass(frozen=True)
+class _Prices:
+    """What a motion of C MuJoCo and its gradient take (s), None where nobody knows before it is compiled, and who steps."""
+
+    motion: float | None
+    gradient: float | None
+    engine: Engine
+
+    @classmethod
+    def of(cls, task: SceneTask) -> "_Prices":
+        by = engine_of(task.scene, task.contact)
+        if not task.num_controls:
+            return cls(None, None, by)
+        each = {kind: task.horizon * seconds for kind, seconds in seconds_of(task.scene).items()}
+        return cls(each["motion"], each[getattr(task.contact, "gradient", "slope")], by)
+
+    @property
+    def is_quick(self) -> bool:
+        """Whether C MuJoCo steps, which compiles nothing."""
+        return self.engine is ENGINES[QUICK]
+
+    def affordable(self, num_swept: int) -> int:
+        """Return as many rollouts of an estimate as take two minutes, within limits."""
+        if self.motion is None or self.gradient is None or not self.is_quick:
+            return _MOST
+        each = num_swept * (self.gradient + _REFERENCE * self.motion)
+        return int(np.clip(BATCH * (_LONGEST // max(BATCH * each, 1e-9)), _FEWEST, _MOST))
+
+    def foretold(self, num_swept: int, num_samples: int, num_reference: int, horizon: int) -> str:
+        """Say what a sweep measures, and what it will take."""
+        what = f"{num_swept} stiffnesses, {num_samples} gradients of {horizon} steps each"
+        first = "compiling first"
+        if self.motion is not None and self.gradient is not None:
+            whole_price = duration(num_swept * (num_samples * self.gradient + num_reference * self.motion))
+            if self.is_quick:
+                what += f": {whole_price}, {BATCH * self.gradient:.2g} s a gradient"
+            else:  # nobody knows before how long that takes
+                first += (
+                    f", a minute or several for a robot; engine mujoco would take {whole_price}, and compiles nothing"
+                )
+        return f"{what}, by {self.engine.title}; {first}"
+
+
+def _advances(say: Callable[[str], None]) -> Callable[[int, int], None]:
+    """Return a function of the parts done and of all, which says at each eighth how long the others take."""
+    began, last = [], [0]
 
     def advanced(done: int, total: int) -> None:
         began.append(time.perf_counter())  # first, when all is compiled
@@ -441,37 +517,24 @@ def sweep(
             left = (began[-1] - began[0]) / (done - 1) * (total - done)
             say(f"{done} of {total} parts, {duration(left)} left")
 
-    what = f"{len(swept)} stiffnesses, {num_samples} gradients of {task.horizon} steps each"
-    first = "compiling first"
-    if price:
-        whole_price = duration(len(swept) * (num_samples * price["gradient"] + num_reference * price["motion"]))
-        if by is ENGINES[QUICK]:
-            what += f": {whole_price}, {BATCH * price['gradient']:.2g} s a gradient"
-        else:  # nobody knows before how long that takes
-            first += f", a minute or several for a robot; engine mujoco would take {whole_price}, and compiles nothing"
-    say(f"{what}, by {by.title}; {first}")
-    if why:
-        say(f"derivatives are those of each step{why}")
-    result = bias_variance(knob, jnp.zeros((1, 1)), jax.random.key(seed), progress=advanced, **given)
-    called = "where the heaviest body ends up (a random mix)" if cost is None else getattr(cost, "__name__", cost)
-    contact, shortest = task.contact, (_SHORT / scene.mj_model.opt.timestep) ** 2
+    return advanced
+
+
+def _measured(task: SceneTask, swept: list[float], notes: list[str], why: str, result: BiasVariance) -> list[str]:
+    """Return sentences on what was swept, by which derivative, and what to heed."""
+    scene, contact = task.scene, task.contact
     kinds = {"slope": "the slope of the outcome", "discrete": "that of each step"}
     kind = kinds.get(getattr(contact, "gradient", ""), f"{contact}")
     none = "No two geoms can touch, so stiffness has no effect."
-    told = [
-        f"Gradient of {called} after {task.horizon} steps, by {knob}.",
-        "Swept contacts are critically damped." if scene.pairs else none,
-        *left_out,
-        f"Derivative: {kind}, by {engine_of(task.scene, contact).title}{why}.",
-    ]
+    told = ["Swept contacts are critically damped." if scene.pairs else none, *notes]
+    told.append(f"Derivative: {kind}, by {engine_of(scene, contact).title}{why}.")
     if exact := touching_exactly(scene, np.asarray(task.state.qpos)):
         told.append(exact_text(exact))
+    shortest = (_SHORT / scene.mj_model.opt.timestep) ** 2
     if isinstance(contact, Slope) and scene.pairs and swept[-1] >= shortest:
         short = "on contacts last at most three time steps, and the slope is off, most by MJX: shorten the time step"
         told.append(f"From {format_number(float(f'{shortest:.1g}'))} 1/s² {short}.")
-    if not np.isfinite(result.table()["truth"]).any():
-        raise ValueError(f"cost must be finite, got NaN or infinity in the rollouts of {called} at every stiffness")
     if result.share < 1:
         reached = f"at {len(result.cost)} of {len(swept)} stiffnesses"
         told.append(f"Interrupted after {result.share:.0%} of the rollouts, {reached}.")
-    return Sweep(scene.name, " ".join(told), knob.own, result)
+    return told

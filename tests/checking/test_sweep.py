@@ -288,6 +288,19 @@ def test_a_cost_that_feels_nothing_is_refused_before_the_sweep(folder):
         mg.sweep(folder / "block.xml", "height:block", horizon=20, engine="mujoco", contact=mg.Discrete())
 
 
+def test_a_gradient_that_is_not_told_from_zero_is_said_before_the_sweep(folder):
+    """The square of a mean speed has its minimum at no push: by symmetry the gradient is zero, at any stiffness."""
+    said, told = [], "by 256 motions, not told from zero; if it stays so, start nearer or look further ahead"
+    still = mg.load_scene(BLOCK.replace('ctrl=".5"', 'ctrl="0"').replace('qvel=".5"', 'qvel="0"'), engine="mujoco")
+    quick = {"horizon": 5, "num_samples": 4, "num_reference": 8, "stiffness": [1e3]}
+    mg.sweep(still, lambda t: t.qvel[-1, 0] ** 2, log=said.append, **quick)
+    first = next(k for k, line in enumerate(said) if "gradients of 5 steps" in line)
+    assert any(line.endswith(told) for line in said[:first]), said
+    said.clear()
+    mg.sweep(still, lambda t: t.qvel[-1, 0], log=said.append, **quick)
+    assert not any(line.endswith(told) for line in said)
+
+
 def test_stiffness_that_the_time_step_does_not_hold_is_left_out_unless_asked_for(folder):
     """At 2 ms and critical damping those from (0.828/h)² = 171573 on: h²k + 2hb = 4, and b = 2√k."""
     cost = f"{folder}/costs.py:reward"
