@@ -465,7 +465,7 @@ def _first_look(
 
 @dataclass(frozen=True)
 class _Prices:
-    """What a motion of C MuJoCo and its gradient take (s), None where nobody knows before it is compiled, and who steps."""
+    """Seconds of a motion by C MuJoCo and of its gradient, None where nobody knows them, and who steps."""
 
     motion: float | None
     gradient: float | None

@@ -7,12 +7,13 @@ import copy
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mjxgrad._interrupts import give_up_if_stopped
 from mjxgrad.engines import inverse
@@ -21,6 +22,7 @@ from mjxgrad.engines.flight import FIRST, PAIRS, Begun
 from mjxgrad.engines.inverse import Inverse
 from mjxgrad.engines.layout import EVERY, INPUTS, Layout
 from mjxgrad.engines.steps import Stepper
+from mjxgrad.scene.numbers import PARAMETERS
 from mjxgrad.stepping import slope
 
 # Stages of a step that are done.
@@ -72,6 +74,7 @@ class Steps:
     gradient: str  # "discrete" or "slope"
     found: _Found  # arrays to be written, by name, with one entry per row
     is_finite: Bool[np.ndarray, " rows"]  # whether a step ends in numbers
+    rates: Mapping[int, Mapping[str, np.ndarray]]  # of fields of each model by its parameters
     begun: dict[int, Begun] = field(default_factory=dict)  # pairs that begin, by row
     # Other models than given, where rounding decides if a contact acts.
     chosen: dict[int, mujoco.MjModel] = field(default_factory=dict)
@@ -109,6 +112,7 @@ class Worker:
         """Write the derivatives of chosen rows, those of one model together."""
         for model, group in itertools.groupby(index, key=lambda i: id(steps.models[i])):
             self._use(steps.models[(rows := list(group))[0]], steps.speeds[model], steps.gradient)
+            self.rates = steps.rates[model]
             for begin in range(0, len(rows), _TOGETHER):
                 give_up_if_stopped()
                 self._together(steps, rows[begin : begin + _TOGETHER])
@@ -431,7 +435,9 @@ class Worker:
     def sense(self, steps: Steps, index: list[int]) -> None:
         """Write the readings of sensors in states, or their derivatives by "state" and all else that is wanted."""
         for i in index:
-            self._use(steps.models[i], steps.speeds[id(steps.models[i])], "discrete")
+            model = id(steps.models[i])
+            self._use(steps.models[i], steps.speeds[model], "discrete")
+            self.rates = steps.rates[model]
             row, found = steps.rows[i], {name: value[i] for name, value in steps.found.items()}
             if not np.isfinite(row).all():
                 continue
@@ -523,12 +529,32 @@ class Worker:
             for entry in range(place.start, place.stop):
                 yield lambda amount, entry=entry: row + amount * np.eye(1, len(row), entry)[0], size, False
             return
-        attribute, both = name.removeprefix("opt."), (by.model, self.surfaces.model)
-        holders = [model.opt for model in both] if name.startswith("opt.") else both
-        present = [np.array(getattr(holder, attribute, []), float).reshape(-1) for holder in holders]
-        for entry, values in enumerate(np.transpose(present).tolist()):
-            change = functools.partial(_with_number, row, holders, attribute, entry, values)
-            yield change, 10 * WIDTH * abs(values[0]) or WIDTH, values[0] == 0.0
+        models = by.model, self.surfaces.model
+        if name == PARAMETERS:
+            yield from self._by_parameters(models, row)
+            return
+        parts = [_Numbers.of(model, name) for model in models]
+        for entry in range(parts[0].values.size):
+            value = parts[0].values[entry]
+            put = functools.partial(_moved, row, [(part, np.array([entry]), np.ones(1)) for part in parts])
+            yield put, 10 * WIDTH * abs(value) or WIDTH, value == 0.0
+
+    def _by_parameters(
+        self, models: tuple[mujoco.MjModel, ...], row: np.ndarray
+    ) -> Iterator[tuple[Callable[[float], np.ndarray], float, bool]]:
+        """Give the same for each parameter, which moves several entries of several arrays at once."""
+        every = [(rates, [_Numbers.of(model, name) for model in models]) for name, rates in self.rates.items()]
+        every = [(rates, parts) for rates, parts in every if parts[0].values.size]  # the others are MJX's own
+        for column in range(next(iter(self.rates.values())).shape[-1]):
+            moved, sizes, is_zero = [], [], True
+            for each, parts in every:
+                rates = each.reshape(parts[0].values.size, -1)[:, column]
+                if (entries := np.flatnonzero(rates)).size:
+                    moved += [(part, entries, rates[entries]) for part in parts]
+                    length = np.linalg.norm(parts[0].values[entries])
+                    sizes.append((10 * WIDTH * length or WIDTH) / np.linalg.norm(rates[entries]))
+                    is_zero &= not length
+            yield functools.partial(_moved, row, moved), min(sizes, default=WIDTH), is_zero
 
     def _rates(self, put: Callable[[float], np.ndarray], size: float, events: Events) -> Float[np.ndarray, " modes"]:
         """Return by how much the modes of events change with what is put."""
@@ -593,16 +619,32 @@ def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) 
     return up if np.linalg.norm(half - up) <= _KINK * np.linalg.norm(up) else 0.0 * up
 
 
-def _with_number(
-    row: np.ndarray, holders: Iterable, attribute: str, entry: int, values: list[float], amount: float
-) -> np.ndarray:
-    """Change a number of models to their values and an amount; the state is as it was."""
-    for holder, value in zip(holders, values, strict=True):
-        present = getattr(holder, attribute)
+@dataclass(frozen=True)
+class _Numbers:
+    """Numbers of a model: who has them, by which name, and what they are."""
+
+    holder: Any
+    name: str
+    values: Float[np.ndarray, " entries"]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, field: str) -> "_Numbers":
+        holder, name = model.opt if field.startswith("opt.") else model, field.removeprefix("opt.")
+        return cls(holder, name, np.array(getattr(holder, name, []), float).reshape(-1))
+
+    def move(self, entries: Int[np.ndarray, " some"], change: Float[np.ndarray, " some"]) -> None:
+        """Change some of them from what they were."""
+        present = getattr(self.holder, self.name)
         if isinstance(present, float):
-            setattr(holder, attribute, value + amount)
+            setattr(self.holder, self.name, self.values.item() + change.item())
         else:
-            present.reshape(-1)[entry] = value + amount
+            present.reshape(-1)[entries] = self.values[entries] + change
+
+
+def _moved(row: np.ndarray, moved: list[tuple[_Numbers, np.ndarray, np.ndarray]], amount: float) -> np.ndarray:
+    """Change numbers of models from what they were, at their rates; the state is as it was."""
+    for numbers, entries, rates in moved:
+        numbers.move(entries, amount * rates)
     return row
 
 
@@ -612,8 +654,8 @@ def with_pairs(wanted: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def moves_gaps(name: str) -> bool:
-    """Return whether an array of the model or an input moves surfaces."""
-    return name.endswith(_SHAPES)
+    """Return whether an array of the model or an input moves surfaces; parameters may."""
+    return name.endswith(_SHAPES) or name == PARAMETERS
 
 
 def is_other(name: str) -> bool:

@@ -21,7 +21,7 @@ from mjxgrad.engines.jacobians import APART, WIDTH, Steps, Worker, solved, with_
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
 from mjxgrad.engines.processes import are_possible, are_started, processes
 from mjxgrad.engines.steps import Stepper
-from mjxgrad.scene.numbers import with_numbers
+from mjxgrad.scene.numbers import PARAMETERS, with_numbers
 from mjxgrad.stepping import slope
 
 ONCE = (*FIRST, "flight")
@@ -31,6 +31,7 @@ _NUMBERS = itertools.count()  # of pools
 # Other processes take derivatives of so many steps and more, if they take so long (s) here. Their start takes half a second.
 _FEWEST, _SHORT, _LONG = 32, 0.05, 2.0
 _MANY = 512  # readings whose derivatives are worth several processes that there are
+_RATES = f"{PARAMETERS}:"
 _MOST_NUMBERS = 2e7  # of derivatives that are held at a time, where they are not asked for
 
 _Arrays = Mapping[str, np.ndarray]
@@ -228,7 +229,7 @@ class Pool:
         num, steps = inputs["ctrl"].shape[:2]
         flat = {k: v.reshape(num * steps, *v.shape[2:]) for k, v in found.items() if k not in ONCE}
         models = self._models(numbers, num)
-        work = self._work(models, before, inputs, gradient, flat)
+        work = self._work(models, numbers, before, inputs, gradient, flat)
         self._share(lambda worker, piece: worker.fill(work, piece), self.workers, len(work.rows))
         if "apart" not in wanted:
             return
@@ -251,7 +252,13 @@ class Pool:
             found["flight"][:] = pairs.packed(self.layout, ends)
 
     def _work(
-        self, models: list, states: _Arrays, inputs: _Arrays, gradient: str, found: dict[str, np.ndarray]
+        self,
+        models: list,
+        numbers: _Arrays,
+        states: _Arrays,
+        inputs: _Arrays,
+        gradient: str,
+        found: dict[str, np.ndarray],
     ) -> Steps:
         """Return the steps from states that have axes of motions and times."""
         num, times = inputs["ctrl"].shape[:2]
@@ -261,8 +268,10 @@ class Pool:
         for model, course in zip(models, states["qvel"], strict=True):
             speeds.setdefault(id(exact[id(model)]), []).append(course[np.isfinite(course).all(axis=1)])
         reached = {key: np.concatenate(courses) for key, courses in speeds.items()}
+        by = {k.removeprefix(_RATES): x for k, x in numbers.items() if k.startswith(_RATES)}
+        rates = {id(exact[id(model)]): {k: x[i % len(x)] for k, x in by.items()} for i, model in enumerate(models)}
         every = [exact[id(model)] for model in models for _ in range(times)]
-        return Steps(rows, every, reached, gradient, found, np.zeros(len(rows), bool))
+        return Steps(rows, every, reached, gradient, found, np.zeros(len(rows), bool), rates)
 
     def sense(
         self, numbers: _Arrays, states: _Arrays, inputs: _Arrays, *, wanted: tuple[str, ...] = ()
@@ -288,7 +297,7 @@ class Pool:
         """Write readings, or their derivatives, into arrays of zeros."""
         num, times = inputs["ctrl"].shape[:2]
         flat = {k: v.reshape(num * times, *v.shape[2:]) for k, v in found.items()}
-        work = self._work(self._models(numbers, num), states, inputs, "discrete", flat)
+        work = self._work(self._models(numbers, num), numbers, states, inputs, "discrete", flat)
         # Derivatives are many short calls, which two threads of Python make half as fast as one.
         workers = self.workers if "readings" in found else self.workers[:1]
         self._share(lambda worker, piece: worker.sense(work, piece), workers, num * times)

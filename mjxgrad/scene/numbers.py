@@ -7,6 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+PARAMETERS = "parameters"
+"""Name of numbers by which those of a model are given, and, before a colon and a field's name, of the field's rates by them."""
 _PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "body_iquat")
 
 

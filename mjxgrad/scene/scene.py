@@ -2,11 +2,12 @@
 
 import dataclasses
 import difflib
+import functools
 import importlib.util
 import logging
 import textwrap
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, get_args
 
 import equinox as eqx
@@ -14,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from mjxgrad._arrays import instance, is_known, one_of, real
+from mjxgrad._arrays import function, instance, is_known, one_of, real
 from mjxgrad._mjx import mjx
 from mjxgrad._text import aligned, format_number, format_range, name_pairs
 from mjxgrad.bodies import constants, tree
@@ -25,7 +27,7 @@ from mjxgrad.contact.collision import candidates
 from mjxgrad.contact.parameters import ContactParameters, Pairs, contact_parameters
 from mjxgrad.contact.warnings import contact_warnings
 from mjxgrad.scene.conversions import Conversion, Omission
-from mjxgrad.scene.numbers import with_numbers
+from mjxgrad.scene.numbers import PARAMETERS, with_numbers
 from mjxgrad.scene.refusals import PARALLEL, UNDECIDED, UNLIKE, has_medium, refusal_messages
 from mjxgrad.stepping import EngineName
 from mjxgrad.stepping.rows import index_of
@@ -61,6 +63,14 @@ class SceneWarning(UserWarning):
     """A scene moves differently from its file, or has a contact that its time step cannot resolve."""
 
 
+class Parametrisation(eqx.Module):
+    """Numbers from which those of a model come, see `Scene.with_parameters`."""
+
+    values: Float[Array, " parameters"]
+    fields: dict[str, Array]  # that come from them
+    rates: dict[str, Float[Array, "*shape parameters"]]  # derivatives of these fields
+
+
 class Scene(eqx.Module):
     """A scene ready to be stepped.
 
@@ -78,6 +88,7 @@ class Scene(eqx.Module):
         chosen: the engine that `with_engine` chose; None for the default.
         max_contacts: as given to `load_scene`; MuJoCo Warp has room for so many contacts of a state.
         more: numbers of the C model that MJX lacks and `with_model` changed, by MuJoCo's names, such as "geom_surfacevel".
+        parametrisation: numbers from which `with_parameters` made others; None without it.
     """
 
     # In what holds a scene it is shown by its name: equinox does not ask `__repr__` there.
@@ -92,6 +103,7 @@ class Scene(eqx.Module):
     chosen: EngineName | None = eqx.field(static=True, default=None)
     max_contacts: int | None = eqx.field(static=True, default=None)
     more: dict[str, Array] = eqx.field(default_factory=dict, repr=False)
+    parametrisation: Parametrisation | None = eqx.field(default=None, repr=False)
 
     @property
     def engine(self) -> EngineName:
@@ -109,7 +121,8 @@ class Scene(eqx.Module):
         if engine == "mjx" and self.unsupported:
             raise SceneError(self.unsupported)
         check_engine(engine, self.mj_model)
-        return dataclasses.replace(self, chosen=engine)
+        kept = self.parametrisation if engine == "mujoco" else None
+        return dataclasses.replace(self, chosen=engine, parametrisation=kept)
 
     def contact_parameters(self) -> ContactParameters:
         """Return the effective parameters of the pairs that can touch, one row each; traceable."""
@@ -186,6 +199,38 @@ class Scene(eqx.Module):
         elif "geom_size" in fields:
             derived = {"geom_rbound": constants.bounding_radii(model)}  # pyright: ignore[reportArgumentType]
         return eqx.tree_at(lambda s: s.model, scene, model.replace(**derived | changed))
+
+    def with_parameters(self, change: Callable[["Scene", PyTree], "Scene"], values: PyTree) -> "Scene":
+        """Return `change(scene, values)`, with derivatives by C MuJoCo along `values` alone: they cost a few steps for each.
+
+        A derivative by `with_model` alone takes every entry of each array that is replaced or follows from one, hundreds in a
+        robot. Values and derivatives are the same; by other engines so is the price.
+
+        Args:
+            change: function of a scene and values to a scene, by `with_model` or `with_softness`.
+            values: numbers, or a pytree of such.
+
+        Raises:
+            ValueError: if `values` are not floats, `change` is no function of two or returns no scene, and as `with_model`.
+        """
+        function("change", change, "scene", "values")
+        values = jax.tree.map(functools.partial(real, "values"), values)
+        instance("what change returns", scene := change(self, values), Scene, "a scene, by scene.with_model")
+        if scene.engine != "mujoco":
+            return scene
+        flat, unravel = ravel_pytree(values)
+        own = _arrays_of(self)
+
+        def changed(vector: Float[Array, " parameters"]) -> dict[str, Array]:
+            every = _arrays_of(change(self, unravel(vector)))
+            # The time step decides when events are, for which whole steps are taken.
+            return {k: x for k, x in every.items() if x is not own.get(k) and k != "opt.timestep"}
+
+        with warnings.catch_warnings():  # which were given above
+            warnings.simplefilter("ignore", SceneWarning)
+            rates = jax.jacfwd(changed)(jax.lax.stop_gradient(flat))
+        fields = {k: x for k, x in _arrays_of(scene).items() if k in rates}
+        return dataclasses.replace(scene, parametrisation=Parametrisation(flat, fields, rates))  # pyright: ignore[reportCallIssue]
 
     @property
     def ctrlrange(self) -> Float[Array, "nu 2"]:
@@ -318,7 +363,19 @@ def changed_numbers(scene: "Scene") -> dict[str, Array]:
         given = np.asarray(getattr(holder, name.removeprefix("opt."), value))
         return not is_known(value) or not np.array_equal(np.ravel(value), np.ravel(given).astype(value.dtype))
 
-    return {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)} | scene.more
+    found = {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)} | scene.more
+    if (by := scene.parametrisation) is None:
+        return found
+    # Those that were replaced since, or came through another transformation of JAX, have derivatives of their own.
+    own = [name for name, value in by.fields.items() if found.get(name) is value]
+    if not own:
+        return found
+    rates = {f"{PARAMETERS}:{name}": jax.lax.stop_gradient(by.rates[name]) for name in own}
+    return found | {k: jax.lax.stop_gradient(found[k]) for k in own} | {PARAMETERS: by.values} | rates
+
+
+def _arrays_of(scene: "Scene") -> dict[str, Array]:
+    return numbers_of(scene.model) | scene.more
 
 
 def _native(model: mujoco.MjModel) -> dict[str, np.ndarray | float]:
