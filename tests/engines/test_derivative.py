@@ -147,6 +147,7 @@ def test_batches_are_those_of_single_calls(pushed):
 def test_a_policy_is_differentiated_through_the_loop(pushed):
     scene = mg.load_scene(SCENES["muscle, tendon, filter"])
 
+    @jax.jit
     def cost(gain):
         policy = lambda gain, state: 0.3 - gain * state.qvel[:1] * jnp.ones(3)  # noqa: E731
         return (
@@ -156,7 +157,7 @@ def test_a_policy_is_differentiated_through_the_loop(pushed):
         )
 
     expected = (cost(0.5 + 1e-4) - cost(0.5 - 1e-4)) / 2e-4
-    for derivative in (jax.grad(cost), jax.jacfwd(cost)):
+    for derivative in (jax.jit(jax.grad(cost)), jax.jit(jax.jacfwd(cost))):
         np.testing.assert_allclose(derivative(0.5), expected, rtol=1e-6)
 
 
@@ -232,7 +233,7 @@ def test_a_change_that_is_followed_is_the_forward_derivative(gradient, geom):
         state = mg.initial_state(scene, qpos, start["qvel"][0] + change[6:])
         return mg.rollout(scene.with_engine("mujoco"), state, horizon=60, contact=own_motion(gradient)).qvel[1:]
 
-    qvel, change = jax.jvp(end, (jnp.zeros(12),), (jnp.asarray(direction),))
+    qvel, change = jax.jit(lambda direction: jax.jvp(end, (jnp.zeros(12),), (direction,)))(jnp.asarray(direction))
     np.testing.assert_allclose(found["qvel"][0], qvel, atol=1e-9)
     np.testing.assert_allclose(found["change"][0, :, 6:], change, atol=1e-5 * np.abs(change).max())
 
@@ -244,7 +245,7 @@ def test_single_precision_has_the_same_derivative_at_rest_and_upright():
         scene = mg.load_scene(SCENES["free box, pyramids"].replace('euler="1 2 3"', ""), engine="mujoco")
         state = mg.initial_state(scene)
         end = lambda v: mg.rollout(scene, dataclasses.replace(state, qvel=v), horizon=5, contact=mg.Slope()).qpos[-1]  # noqa: E731
-        return np.asarray(jax.jacrev(end)(jnp.zeros_like(state.qvel)))
+        return np.asarray(jax.jit(jax.jacrev(end))(jnp.zeros_like(state.qvel)))
 
     double = slopes()
     with jax.enable_x64(False):
@@ -284,7 +285,7 @@ def test_gaps_smaller_than_differences_do_not_multiply_derivatives():
         course = mg.rollout(scene.with_engine("mujoco"), start, horizon=50, measure_growth=True)
         return course.qpos[-1], course.explodes
 
-    gained, explodes = jax.jacfwd(end, has_aux=True)(jnp.array([0.3, -0.1, 0.2]))
+    gained, explodes = jax.jit(jax.jacfwd(end, has_aux=True))(jnp.array([0.3, -0.1, 0.2]))
     assert not explodes
     assert 0 < gained[0, 0] < 1
 
@@ -321,9 +322,13 @@ def test_a_bottle_that_stands_on_a_table_is_turned_by_its_weight_and_not_by_whic
         <body pos="0 .1 .08"><freejoint/><geom type="cylinder" size=".03 .08" mass=".25"/></body></worldbody></mujoco>"""
     scene = mg.load_scene(xml, engine="mujoco")
     model, data, product = scene.mj_model, mujoco.MjData(scene.mj_model), np.eye(12)
+
+    @jax.jit
+    def linearised(qpos, qvel):
+        return mg.linearise(scene, mg.initial_state(scene, qpos, qvel), contact=mg.Discrete()).A
+
     for number in range(50):
-        start = mg.initial_state(scene, data.qpos.copy(), data.qvel.copy())
-        found = np.asarray(mg.linearise(scene, start, contact=mg.Discrete()).A)
+        found = np.asarray(linearised(data.qpos.copy(), data.qvel.copy()))
         product = found @ product
         if number > 5:
             expected, _ = by_whole_steps(model, data.qpos, data.qvel, data.act, data.ctrl, width=1e-3)
@@ -380,7 +385,7 @@ def test_what_a_search_for_contacts_leaves_is_not_divided_by_a_width():
         return mg.rollout(scene, start, horizon=200, contact=mg.Discrete()).qpos[-1, 0]
 
     speeds = jnp.array([0.9, 1.0, 1.1])
-    ways, slopes = jax.vmap(jax.value_and_grad(way))(speeds)
+    ways, slopes = jax.jit(jax.vmap(jax.value_and_grad(way)))(speeds)
     np.testing.assert_allclose(slopes, (ways[2] - ways[0]) / 0.2, rtol=3e-3)  # it hardly curves: 0.9689 to 0.9694
 
 

@@ -224,7 +224,7 @@ def test_a_delayed_actuator_keeps_its_history(way, integrator):
             return mg.rollout(scene.with_engine("mujoco"), half.final, controls[20:] + added).qpos[-1, 0]
         return mg.rollout(scene.with_engine("mujoco"), start, controls + added).qpos[-1, 0]
 
-    value, derivative = jax.value_and_grad(end)(0.0)
+    value, derivative = jax.jit(jax.value_and_grad(end))(0.0)
     np.testing.assert_allclose(value, by_mujoco(0.0), rtol=1e-9)
     np.testing.assert_allclose(derivative, (by_mujoco(1e-6) - by_mujoco(-1e-6)) / 2e-6, rtol=1e-6)
 

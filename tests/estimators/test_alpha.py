@@ -96,8 +96,10 @@ STEP = 1 / (np.sqrt(2 * np.pi) * 0.1)  # slope of a smoothed step of height 1 at
 def test_alpha_order_is_as_good_as_the_better_part(function, dim, truth, num_samples, most):
     """At each by mean squared error over batches, in units of the better of first and zeroth order."""
     objective = parameter_noise(function, 0.1, dim=dim)
+    # Errors of many coordinates add up to nearly the same in every batch.
+    count = 1000 if dim < 30 else 250
     first, zeroth, mixed = (
-        error_of(repeat(f, objective, jnp.zeros(dim), 1000, seed=0, num_samples=num_samples), truth)
+        error_of(repeat(f, objective, jnp.zeros(dim), count, seed=0, num_samples=num_samples), truth)
         for f in (estimators.first_order, estimators.zeroth_order, estimators.alpha_order)
     )
     best = min(first, zeroth)

@@ -43,6 +43,9 @@ PAIR = """<mujoco><asset>
   <mesh name="m" vertex="-.1 -.1 -.1  .1 -.1 -.1  -.1 .1 -.1  .1 .1 -.1  0 0 .1"/>
   <hfield name="h" nrow="3" ncol="3" size=".5 .5 .1 .1" elevation="0 0 0 0 1 0 0 0 0"/></asset>
 <worldbody><geom {}/><body><freejoint/><geom {} mass="1"/></body></worldbody></mujoco>"""
+# As XLA compiles quickest, see `conftest`, both modes of capsule and box round differently in a few poses where two corners are
+# equally near, though they are of one linearisation, and then take the derivative of either.
+_ALIKE = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_DEFAULT"} if jax.__version_info__ < (0, 11) else None
 _TILTS = (0.0, *(10.0**-k for k in range(4, 26, 3)))
 
 
@@ -72,10 +75,10 @@ def _contacts(pair):
     return contacts
 
 
-def _over_poses(*functions):
-    """Return what functions of a motion and a pose give of all poses at rest."""
+def _over_poses(function):
+    """Return what a function of a motion and a pose gives of all poses at rest."""
     poses = jnp.asarray(_poses(), jnp.result_type(float))
-    return jax.jit(jax.vmap(lambda pose: [function(jnp.zeros(6), pose) for function in functions]))(poses)
+    return jax.jit(jax.vmap(lambda pose: function(jnp.zeros(6), pose)), compiler_options=_ALIKE)(poses)
 
 
 @pytest.mark.parametrize(
@@ -88,11 +91,21 @@ def test_contacts_of_nearly_symmetric_poses_have_both_derivatives(pair):
     those of a face there is nothing to compare.
     """
     width, eye = 1e-6, jnp.eye(6)
+
+    def both(rest, pose):  # of one linearisation, as `jax.jacfwd` and `jax.jacrev` take it one by one
+        value, push = jax.linearize(lambda motion: contacts(motion, pose), rest)
+        (pulled,) = jax.vmap(jax.linear_transpose(push, rest))(jnp.eye(value.size, dtype=value.dtype))
+        return value, jax.vmap(push, out_axes=1)(jnp.eye(6)), pulled
+
+    def around(rest, pose):
+        near = rest + width * jnp.concatenate([eye, -eye])
+        return contacts(rest, pose), jax.jacfwd(contacts)(rest, pose), jax.vmap(contacts, (0, None))(near, pose)
+
     with jax.enable_x64(False):
-        value, forward, reverse = _over_poses(_contacts(pair), jax.jacfwd(_contacts(pair)), jax.jacrev(_contacts(pair)))
-    contacts, around = _contacts(pair), width * jnp.concatenate([eye, -eye])
-    near = lambda rest, pose: jax.vmap(contacts, (0, None))(rest + around, pose)  # noqa: E731
-    there, slope, beside = _over_poses(contacts, jax.jacfwd(contacts), near)
+        contacts = _contacts(pair)
+        value, forward, reverse = _over_poses(both)
+    contacts = _contacts(pair)
+    there, slope, beside = _over_poses(around)
     right, left = (
         (x - there[:, None, 1]) / w for x, w in zip(np.split(beside[..., 1], 2, 1), (width, -width), strict=True)
     )
