@@ -19,6 +19,7 @@ from mjxgrad.engines.events import levers_of
 from mjxgrad.engines.flight import FIRST, NUM_SLOTS, PAIRS, Course, Flight, advance, fly
 from mjxgrad.engines.jacobians import APART, WIDTH, Steps, Worker, solved, with_pairs
 from mjxgrad.engines.layout import EVERY, MOTION, USER, Layout
+from mjxgrad.engines.multiplied import SlopeWarning, multiplied
 from mjxgrad.engines.processes import are_possible, are_started, processes
 from mjxgrad.engines.steps import Stepper
 from mjxgrad.scene.numbers import PARAMETERS, with_numbers
@@ -61,6 +62,7 @@ class Pool:
         self.lengths = levers.max(axis=0)
         self.workers = [Worker(self.layout, levers) for _ in range(num_threads)]
         self.may_share = mj_model.nplugin == 0  # another process may not have its library
+        self.looks, self.has_warned = 0, False  # batches of slopes, and whether one multiplied
         self.pace, self.spent = 0.0, 0.0  # seconds of a step's derivatives, and of all that were taken
         self.poses = np.concatenate([mj_model.key_qpos, mj_model.qpos0[None]])
         self.template = np.zeros(self.layout.size)
@@ -168,8 +170,19 @@ class Pool:
                 )
                 flight = np.zeros((num * steps, 0))
             found = self._found(numbers, states, inputs, flight, gradient=gradient, wanted=wanted)
+        if "apart" in wanted and not flight.any():
+            self._heed(numbers, states, inputs, found)
         own = {name: x.shape[1:] if name in ONCE else (steps, *x.shape[2:]) for name, x in found.items()}
         return {name: found[name].reshape(*batch, *own[name]) for name in ("state", *wanted)}
+
+    def _heed(self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, found: _Arrays) -> None:
+        """Warn, once, if slopes multiply: in the first, second, fourth batch and so on, so that it costs next to nothing."""
+        self.looks += 1
+        if self.has_warned or self.looks & (self.looks - 1):
+            return
+        if told := multiplied(self.run, self.mj_model, self.layout, numbers, before, inputs, found):
+            self.has_warned = True
+            warnings.warn(told, SlopeWarning, stacklevel=2)
 
     def _found(
         self, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: np.ndarray, *,
