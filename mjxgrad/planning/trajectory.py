@@ -9,14 +9,17 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, Real
 
 from mjxgrad._arrays import Legible, instance, is_known, known, one_key, real, traceable, whole
+from mjxgrad._interrupts import patiently
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
 from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
+from mjxgrad.rollouts import State
 from mjxgrad.rollouts.rollout import sequence_of
 
 _Row = Float[Array, "*iterations"]
@@ -37,6 +40,7 @@ _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of 
 _USUAL = 0.05  # of a control's range, and _UNLIMITED where it has none: the deviation of random changes
 _UNLIMITED = 0.1
 NO_COST = "the cost of the given controls is no finite number, though all their states are"
+_ITERATIONS = 20  # unless a schedule says
 _TRUSTED = 0.8  # of what a linear model promises: where as much comes true, no random change is taken
 _KEPT = 0.2  # of what linear models promised; where less came true, random changes are advised
 
@@ -263,12 +267,12 @@ def random_changes(
 def optimise_trajectory(
     system: System,
     cost: Cost,
-    start: Real[ArrayLike, " state"],
+    start: Real[ArrayLike, " state"] | State | mujoco.MjData,
     controls: Float[ArrayLike, "horizon m"],
     key: PRNGKeyArray,
     *,
-    smoother: Smoother,
-    schedule: Float[ArrayLike, " iterations"],
+    smoother: Smoother = Exact(),
+    schedule: Float[ArrayLike, " iterations"] | None = None,
     num_samples: int = 0,
     stddev: ArrayLike | None = None,
     lower: ArrayLike | None = None,
@@ -283,11 +287,12 @@ def optimise_trajectory(
     Args:
         system: the system to be controlled.
         cost: the cost to be minimised.
-        start: the first state.
+        start: the first state: a vector of the system, or for a scene its `State` or C MuJoCo's data.
         controls: initial controls, one row per step; clipped to the limits.
         key: consumed here. All iterations use the same noise of the smoother, so that costs can be compared.
         smoother: the smoother of the linear models at factor 1; `Exact()` is plain iLQR.
         schedule: positive factor of the smoothing in each iteration; it should fall until the smoothed course is the true one.
+            None takes 20 iterations, where nothing is smoothed.
         num_samples: plans with random changes that are tried beside the step lengths in each iteration. They find what
             derivatives do not see, and go on where linear models hold for tiny steps alone, as where an object may topple.
             None is taken where four fifths of what the linear model promises come true.
@@ -297,10 +302,10 @@ def optimise_trajectory(
         upper: upper limits of the controls, as `lower`.
 
     Returns:
-        The plan; `plan.verdict()` says how it ended.
+        The plan; `plan.verdict()` says how it ended. Ctrl-C ends with the best so far, but within `jax.jit`.
 
     Warns:
-        UserWarning: if the smoothing reaches contacts with friction that hold bodies to the floor.
+        UserWarning: if the smoothing reaches contacts with friction that hold bodies to the floor; and after Ctrl-C.
 
     Raises:
         ValueError: if shapes do not fit, a limit is above its opposite, an argument is of another kind or not finite, or the
@@ -312,16 +317,22 @@ def optimise_trajectory(
     """
     one_key(key)
     num_samples = whole("num_samples", num_samples, 0)
+    if schedule is None:
+        if not isinstance(smoother, Exact):
+            wanted = "one factor of the smoothing per iteration, such as jnp.geomspace(1, 0.01, 20)"
+            raise ValueError(f"schedule must be given with a smoother: {wanted}")
+        schedule = np.ones(_ITERATIONS)
     problem, begin, controls, (factors,) = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
     spread = deviations(stddev, problem)
+    given = problem, begin, controls, factors, jax.random.fold_in(key, 1), spread
     with traceable("cost"):
-        return _improved(problem, begin, controls, factors, jax.random.fold_in(key, 1), spread, num_samples)
+        return (_improved if is_traced(given) else _one_by_one)(*given, num_samples)
 
 
 def posed(
     system: System,
     cost: Cost,
-    start: ArrayLike | None,
+    start: ArrayLike | State | mujoco.MjData | None,
     controls: ArrayLike,
     key: PRNGKeyArray,
     smoother: Smoother,
@@ -357,11 +368,14 @@ def posed(
     return Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper), begin, controls, factors
 
 
-def _start(system: System, start: ArrayLike | None) -> StateVector:
+def _start(system: System, start: ArrayLike | State | mujoco.MjData | None) -> StateVector:
     """Return the first state as floats."""
     if start is None:
         return system.origin
-    begin, origin = real("start", start), system.origin
+    origin = system.origin
+    if isinstance(start, State | mujoco.MjData):
+        start = jnp.concatenate([jnp.asarray(getattr(start, name)) for name in ("qpos", "qvel", "act")])
+    begin = real("start", start)
     if begin.shape != origin.shape:
         raise ValueError(f"start must have shape {origin.shape} in this system, got {begin.shape}")
     if is_known(begin) and not np.isfinite(begin).all():
@@ -388,6 +402,39 @@ def deviations(stddev: ArrayLike | None, problem: Problem) -> ControlVector:
     return given
 
 
+class _At(eqx.Module):
+    """Numbers that differ from iteration to iteration, of one or, along an axis, of all."""
+
+    factor: Float[Array, "*iterations"]
+    following: Float[Array, "*iterations"]  # factor of the next iteration
+    is_first: Bool[Array, "*iterations"]
+    key: Key[Array, "*iterations"]
+
+    @classmethod
+    def of(cls, factors: Float[Array, " iterations"], key: PRNGKeyArray) -> "_At":
+        """Return those of a schedule. An extra first iteration computes the given controls' course."""
+        present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
+        return cls(present, following, jnp.arange(len(present)) == 0, jax.random.split(key, len(present)))
+
+
+_Record = tuple[Iterations, _Row]  # of one iteration or of all, and the regularisation that was held
+
+
+def _iterated(
+    problem: Problem, search: Search, at: _At, stddev: ControlVector, num_samples: int
+) -> tuple[Search, _Record]:
+    """Return the search after an iteration, and its record."""
+    noise = random_changes(at.key, stddev, num_samples, len(search.course.controls))
+    improved = lambda: problem.solved(problem.linearised(search, at.factor))  # noqa: E731
+    # Within the program, or what the first iteration takes would be compiled a second time.
+    search, held = jax.lax.cond(at.is_first, lambda: search, improved), search.regularisation
+    search, true, step = problem.chosen(search, at.following, at.is_first, noise)
+    return search, (Iterations(at.factor, search.course.cost, true, step, search.law.promised), held)
+
+
+_one_iteration = compiled(_iterated)
+
+
 @compiled
 def _improved(
     problem: Problem,
@@ -398,23 +445,41 @@ def _improved(
     stddev: ControlVector,
     num_samples: int,
 ) -> Plan:
-    """Return the plan; its data are arguments, so that to plan again needs no new compilation."""
-    # An extra first iteration computes the given controls' course; outside the loop it would be compiled a second time.
-    present, following = jnp.insert(factors, 0, factors[0]), jnp.append(factors, factors[-1])
-    inputs = (present, following, jnp.arange(len(present)) == 0, jax.random.split(key, len(present)))
+    """Return the plan, in one program."""
+    advance = lambda search, at: _iterated(problem, search, at, stddev, num_samples)  # noqa: E731
+    return _ended(*jax.lax.scan(advance, problem.begin(start, controls), _At.of(factors, key)))
 
-    def iterate(
-        search: Search, at: tuple[_Scalar, _Scalar, Bool[Array, ""], PRNGKeyArray]
-    ) -> tuple[Search, tuple[Iterations, _Scalar]]:
-        factor, following, is_first, key = at
-        noise = random_changes(key, stddev, num_samples, len(controls))
-        improved = lambda: problem.solved(problem.linearised(search, factor))  # noqa: E731
-        search, held = jax.lax.cond(is_first, lambda: search, improved), search.regularisation
-        search, true, step = problem.chosen(search, following, is_first, noise)
-        return search, (Iterations(factor, search.course.cost, true, step, search.law.promised), held)
 
-    found, (rows, held) = jax.lax.scan(iterate, problem.begin(start, controls), inputs)
-    start_cost, (rows, held) = rows.cost[0], jax.tree.map(lambda x: x[1:], (rows, held))
+def _one_by_one(
+    problem: Problem,
+    start: StateVector,
+    controls: _Controls,
+    factors: Float[Array, " iterations"],
+    key: PRNGKeyArray,
+    stddev: ControlVector,
+    num_samples: int,
+) -> Plan:
+    """Return the same plan by a program for an iteration; Ctrl-C ends with what was found, once the given plan is known."""
+    every, search, records = _At.of(factors, key), problem.begin(start, controls), []
+    for number in range(1 + len(factors)):
+        at, before = jax.tree.map(lambda x, k=number: x[k], every), search
+        one = lambda at=at, before=before: _one_iteration(problem, before, at, stddev, num_samples)  # noqa: E731
+        try:
+            search, record = patiently(lambda one=one: jax.block_until_ready(one()))
+        except KeyboardInterrupt:
+            if not records[1:]:
+                raise
+            told = f"interrupted after {number - 1} of {len(factors)} iterations: the plan is the best of these"
+            warnings.warn(told, stacklevel=3)
+            break
+        records.append(record)
+    return _ended(search, jax.tree.map(lambda *x: jnp.stack(x), *records))
+
+
+@compiled
+def _ended(found: Search, records: _Record) -> Plan:
+    """Return the plan of a search and the records of its iterations, the first of which is the given plan's."""
+    start_cost, (rows, held) = records[0].cost[0], jax.tree.map(lambda x: x[1:], records)
     # What is held to the controls as they are promises nothing, either.
     promised = rows.promised[jnp.max(jnp.where(held <= FREE, jnp.arange(len(held)), 0))]
     return Plan(

@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
@@ -20,6 +21,7 @@ from mjxgrad.planning import (
     SceneSystem,
     Smoother,
     optimise_trajectory,
+    trajectory,
 )
 from mjxgrad.planning.system import terminal_model
 from mjxgrad.planning.trajectory import minimise_in_box
@@ -82,6 +84,54 @@ def test_one_step_on_a_linear_problem_falls_by_what_it_promised():
     plan = planned(jnp.array(1e3))
     np.testing.assert_allclose(plan.iterations.promised[0], plan.start_cost - plan.iterations.cost[0], rtol=1e-6)
     assert plan.iterations.step[0] == 1
+
+
+def test_ctrl_c_ends_with_the_best_of_the_iterations_before(monkeypatch):
+    """In the third iteration; in the first nothing was found. As one program, under `jax.jit`, it is the same plan."""
+    system, cost = FunctionSystem(affine, 2, 2), GoalCost(GOAL, STAGE, TERMINAL, CONTROL)
+
+    def plan(schedule=None, last=None):
+        left = iter(range(99 if last is None else last))
+
+        def call(work):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return work()
+
+        monkeypatch.setattr(trajectory, "patiently", call)
+        given = system, cost, START, jnp.zeros((HORIZON, 2)), jax.random.key(0)
+        return optimise_trajectory(*given, schedule=schedule, lower=-2.0, upper=2.0)
+
+    with pytest.warns(UserWarning, match="interrupted after 2 of 20 iterations: the plan is the best of these"):
+        found = plan(last=3)
+    expected = plan(schedule=np.ones(2))
+    assert found.iterations.cost.shape == (2,)
+    for name in ("controls", "cost", "start_cost"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    whole = plan()
+    assert whole.cost < found.cost
+    np.testing.assert_allclose(whole.controls, planned(jnp.array(2.0)).controls, atol=1e-6)
+    for nothing in (0, 1):
+        with pytest.raises(KeyboardInterrupt):
+            plan(last=nothing)
+
+
+def test_a_scenes_plan_starts_at_its_state_or_its_data():
+    scene = mg.load_scene(
+        """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body></worldbody>
+        <actuator><motor joint="x"/></actuator></mujoco>"""
+    )
+    system = SceneSystem(scene=scene.with_engine("mujoco"))
+    data = mujoco.MjData(scene.mj_model)
+    data.qpos[:], data.qvel[:] = 0.3, -0.2
+    starts = jnp.array([0.3, -0.2]), data, mg.initial_state(scene, np.array([0.3]), np.array([-0.2]))
+    cost = GoalCost(jnp.zeros(2), jnp.ones(2), jnp.ones(2), 1.0)
+    plans = [optimise_trajectory(system, cost, x, jnp.zeros((3, 1)), jax.random.key(0), schedule=np.ones(1)) for x in starts]
+    for one in plans:
+        np.testing.assert_array_equal(one.states, plans[0].states)
+    given = system, cost, data, jnp.zeros((3, 1)), jax.random.key(0)
+    with pytest.raises(ValueError, match="schedule must be given with a smoother: one factor of the smoothing per"):
+        optimise_trajectory(*given, smoother=Analytic(Smoothing(0.01)))
 
 
 @pytest.mark.parametrize("seed", range(5))
