@@ -237,7 +237,8 @@ class Identification(Printed):
         columns = [np.concatenate([np.ravel(part[name]) for name in self.values]) for part in parts]
         told = {"covariance": self.covariance, "inseparable": self.inseparable}
         columns += [self.coordinates.lower, self.coordinates.upper, _partners(told, self.coordinates)]
-        rows = [("parameter", "found", "± 95 %", "start", "bounds", "goes with")]
+        spread = "± 95 %" if self.stopped is Stopped.CONVERGED else "± by noise alone"
+        rows = [("parameter", "found", spread, "start", "bounds", "goes with")]
         for name, found, half, start, low, high, partners in zip(self.names, *columns, strict=True):
             unit = self.units.get(name.split("[")[0], "")
             shown = (_digits(found, half), f"{half:.2g}" if np.isfinite(half) else "unknown", format_number(start))
@@ -248,10 +249,15 @@ class Identification(Printed):
     def warnings(self) -> list[str]:
         """Return warnings of a sentence or two each, such as a stalled search or undetermined numbers."""
         found = []
+        if self.is_measured and self.stopped in (Stopped.INTERRUPTED, Stopped.STEPS):
+            found.append(
+                "The search had not converged, so values may be off by many times what noise alone leaves. Go on with these as "
+                "first values, or give it more time or steps (--max-steps)."
+            )
         if self.is_measured and self.share < 1:
             found.append(
                 f"The search stopped when it had used the first {100 * self.share:.0f} % of the recordings. The error is that "
-                "over the whole, of the best values visited. Give it more steps (--max-steps) or time."
+                "over the whole, of the best values visited."
             )
         elif self.has_noise and self._is_unexplained:
             free = "" if self.offsets is not None else "free_start=True (--start free), "

@@ -62,6 +62,8 @@ def test_an_interrupted_search_returns_the_best_values_so_far(cart):
     assert result.num_steps == 1
     assert np.isfinite(result.half_width["gear"])
     assert result.headline.startswith("Interrupted, best so far: error")
+    assert "± by noise alone" in result.summary()
+    assert "had not converged, so values may be off by many times what noise alone leaves" in result.warnings()[0]
 
 
 def test_over_a_part_of_a_recording_the_motion_at_its_last_state_is_compared_with_that_state(cart):
