@@ -48,6 +48,7 @@ _FEW = 8  # numbers of a direction that are printed
 _NEARER = 0.5  # of the slope's error, below which the derivative of each step is taken
 # Rollouts of each estimate that nobody chose, with derivatives; by C MuJoCo as many as take so long (s). And those of the truth.
 _FEWEST, _MOST, _LONGEST, _REFERENCE = 64, 256, 120.0, 16
+_NEAR = 0.5  # of the gradient, an error with which descents get somewhere
 _HOPELESS = 10.0  # of the gradient, an error that is no estimate
 _NAMES = {**ESTIMATES, "none": "none"}
 
@@ -292,13 +293,24 @@ class Sweep(Paged):
             sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}"
         others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
         answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient."
-        answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}."
+        answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}{self._needed(taken, row)}."
         later = []
         for label, other, is_off in list(zip(self.labels, best, self.result.too_stiff, strict=True))[row + 1 :]:
             if not is_off and other != taken:
                 later.append(f"from {label} 1/s² on {_NAMES[other]}")
                 taken = other
         return f"{answer} F{', '.join(later)[1:]}." if later else answer
+
+    def _needed(self, name: str, row: int) -> str:
+        """Say from how many rollouts an estimate is half off, where from a batch it is off by more than the gradient."""
+        table, truth = self.result.table(), abs(self.result.table()["truth"][row, 0])
+        if (off := self.errors()[name][row]) <= 1:
+            return ""
+        variance = table[f"{name}_variance"][row, 0]
+        left = (_NEAR * truth) ** 2 - max((off * truth) ** 2 - variance / BATCH, 0.0)  # for scatter, beside the bias
+        if left <= 0:
+            return "; more rollouts do not mend its bias"
+        return f"; it is {percent(_NEAR)} off from about {format_number(float(f'{variance / left:.1g}'))}"
 
     def __str__(self) -> str:
         errors = "\n".join([_ERRORS, *aligned(self._rows(), str.ljust)])

@@ -263,6 +263,8 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
     table["alpha_order_variance"][:] = 100.0
     assert swept.headline.startswith("Take zeroth order: it has no bias; ")
     assert " it is 50 % off, first order 200 %, α-order 250 %." in swept.headline
+    table["zeroth_variance"][:], table["alpha_order_variance"][:] = 64.0, 1e3
+    assert "; it is 50 % off from about 300." in swept.headline  # 64 / 0.5² is 256
     for name in halves:
         table[f"{name}_variance"] = np.array([[4.0], [1e5], [4.0]])
     assert swept.headline == (
