@@ -73,7 +73,7 @@ def _parted(
 ) -> Float[np.ndarray, "widths steps nv"]:
     """Return how far motions part whose starts are apart along a change, over that."""
     nv, sizes = model.nv, np.array([side * size for size in _APART for side in (1.0, -1.0)])
-    start = {name: np.repeat(before[name][:1, 0], len(sizes), axis=0) for name in ("time", *MOTION)}
+    start = {name: np.repeat(before[name][:1, 0], len(sizes), axis=0) for name in ("time", *MOTION) if name in before}
     for qpos, size in zip(start["qpos"], sizes, strict=True):
         mujoco.mj_integratePos(model, qpos, change[:nv], size)
     start["qvel"] = start["qvel"] + sizes[:, None] * change[nv : 2 * nv]
