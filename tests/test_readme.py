@@ -95,10 +95,23 @@ def _tells_which_gradient_holds(names):
     assert "<svg" in Path("sweep.html").read_text()
 
 
+def _goes_less_far(names):
+    """Under a force of 1 for T = 0.4 s with mass m and damping c: x = T/c − m (1 − exp(−cT/m)) / c², in steps of 2 ms."""
+    way = lambda m, c: 0.4 / c - m * (1 - np.exp(-c * 0.4 / m)) / c**2  # noqa: E731
+    width = 1e-4
+    np.testing.assert_allclose(
+        names["gradient"]["mass"], (way(1 + width, 1) - way(1 - width, 1)) / (2 * width), rtol=0.02
+    )
+    np.testing.assert_allclose(
+        names["gradient"]["damping"], (way(1, 1 + width) - way(1, 1 - width)) / (2 * width), rtol=0.02
+    )
+
+
 # What is looked at after each how-to, and the object that its cell shows in a notebook.
 _CHECKS = {
     _moves_and_is_filmed: "mg.check(scene, derivatives=False)",
     _finds_the_parameters: "result",
+    _goes_less_far: "gradient",
     _stands: "learned",
     _pushes_the_ball_to_its_place: "pusher",
     _balances: "balance",

@@ -535,7 +535,7 @@ class Worker:
             return
         parts = [_Numbers.of(model, name) for model in models]
         for entry in range(parts[0].values.size):
-            value = parts[0].values[entry]
+            value = parts[0].values[entry].item()
             put = functools.partial(_moved, row, [(part, np.array([entry]), np.ones(1)) for part in parts])
             yield put, 10 * WIDTH * abs(value) or WIDTH, value == 0.0
 

@@ -18,7 +18,16 @@ from mjxgrad._interrupts import patiently
 from mjxgrad._programs import compiled, is_traced
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.linear_model import Analytic, Exact, LinearModel, Smoother
-from mjxgrad.planning.system import ControlVector, Cost, Quadratic, StateVector, System, stage_model, terminal_model
+from mjxgrad.planning.system import (
+    ControlVector,
+    Cost,
+    Quadratic,
+    SceneSystem,
+    StateVector,
+    System,
+    stage_model,
+    terminal_model,
+)
 from mjxgrad.rollouts import State
 from mjxgrad.rollouts.rollout import sequence_of
 
@@ -373,7 +382,7 @@ def _start(system: System, start: ArrayLike | State | mujoco.MjData | None) -> S
     if start is None:
         return system.origin
     origin = system.origin
-    if isinstance(start, State | mujoco.MjData):
+    if isinstance(system, SceneSystem) and isinstance(start, State | mujoco.MjData):
         start = jnp.concatenate([jnp.asarray(getattr(start, name)) for name in ("qpos", "qvel", "act")])
     begin = real("start", start)
     if begin.shape != origin.shape:
