@@ -111,7 +111,7 @@ def _goes_less_far(names):
 _CHECKS = {
     _moves_and_is_filmed: "mg.check(scene, derivatives=False)",
     _finds_the_parameters: "result",
-    _goes_less_far: "gradient",
+    _goes_less_far: "scene",
     _stands: "learned",
     _pushes_the_ball_to_its_place: "pusher",
     _balances: "balance",

@@ -72,8 +72,11 @@ def test_they_are_the_differences_of_whole_motions_in_c_mujoco(scene):
         assert_allclose(found[name], expected, atol=2e-5 * np.abs(expected).max(), err_msg=name)
 
 
-@pytest.mark.parametrize("contact", [mg.Discrete(), mg.Slope()], ids=["discrete", "slope"])
-@pytest.mark.parametrize("error", ["double", "single"])
+@pytest.mark.parametrize(
+    ("contact", "error"),
+    [(mg.Discrete(), "double"), (mg.Slope(), "double"), (mg.Slope(), "single")],
+    ids=["discrete", "slope", "slope in single precision"],
+)
 def test_they_are_those_by_every_entry_and_take_one_column_each(scene, contact, error, monkeypatch):
     """Of the same model by `with_model` alone, a column each in place of one per entry; both modes, and of a batch."""
     asked = []
