@@ -126,7 +126,9 @@ def test_a_scenes_plan_starts_at_its_state_or_its_data():
     data.qpos[:], data.qvel[:] = 0.3, -0.2
     starts = jnp.array([0.3, -0.2]), data, mg.initial_state(scene, np.array([0.3]), np.array([-0.2]))
     cost = GoalCost(jnp.zeros(2), jnp.ones(2), jnp.ones(2), 1.0)
-    plans = [optimise_trajectory(system, cost, x, jnp.zeros((3, 1)), jax.random.key(0), schedule=np.ones(1)) for x in starts]
+    plans = [
+        optimise_trajectory(system, cost, x, jnp.zeros((3, 1)), jax.random.key(0), schedule=np.ones(1)) for x in starts
+    ]
     for one in plans:
         np.testing.assert_array_equal(one.states, plans[0].states)
     given = system, cost, data, jnp.zeros((3, 1)), jax.random.key(0)
