@@ -1,7 +1,5 @@
 """Unitree's G1 and Go1 of mjlab, downloaded on first use: on a floor, with position servos, their real masses and torques."""
 
-from collections.abc import Sequence
-
 import mujoco
 
 _WHEEL, _FOLDER = "mjlab==1.6.0", "mjlab/asset_zoo/robots"
@@ -27,8 +25,12 @@ def go1() -> mujoco.MjModel:
     """Return the quadruped, its key frame a stance; it touches the floor alone, and a time step is 4 ms."""
     model = _on_floor("unitree_go1/xmls/go1.xml", "trunk", _GO1, 0.288, joint_damping=0.03, armature=0.005)
     model.opt.timestep, model.opt.integrator = 0.004, mujoco.mjtIntegrator.mjINT_EULER
-    is_floor = model.geom_bodyid == 0
-    touches = (model.geom_contype | model.geom_conaffinity) > 0
+    return touching_the_floor_alone(model)
+
+
+def touching_the_floor_alone(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model, of which no two parts of the robot touch any more."""
+    is_floor, touches = model.geom_bodyid == 0, (model.geom_contype | model.geom_conaffinity) > 0
     model.geom_contype[:], model.geom_conaffinity[:] = is_floor & touches, ~is_floor & touches
     return model
 
@@ -66,9 +68,8 @@ def _on_floor(
 def _furnish(spec: mujoco.MjSpec, base: str) -> None:
     """Add a chequered floor, a sky, a light, and a camera that follows the base."""
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.1], material="floor")
-    axes: Sequence[float] = [0.55, 0.83, 0, -0.15, 0.1, 1]
-    track = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
-    spec.body(base).add_camera(name="track", mode=track, pos=[2.4, -1.6, 0.3], xyaxes=axes)
+    follows = {"mode": mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, "xyaxes": [0.55, 0.83, 0, -0.15, 0.1, 1]}
+    spec.body(base).add_camera(name="track", pos=[2.4, -1.6, 0.3], **follows)
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.2, 0.3, -1], diffuse=[0.3] * 3, castshadow=False, type=_SUN)
     sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT}
     spec.add_texture(name="sky", **sky, rgb1=[0.85, 0.9, 0.95], rgb2=[1, 1, 1], width=32, height=32)

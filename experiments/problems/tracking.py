@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from experiments.problems.mjlab import g1
+from experiments.problems.mjlab import g1, touching_the_floor_alone
 from experiments.problems.quadruped import in_trunk
 from mjxgrad.envs.environment import Environment, Rewards
 from mjxgrad.rollouts import State, initial_state
@@ -91,9 +91,7 @@ class Tracking(Environment):
 
 def tracking(engine: EngineName = "mjx") -> Tracking:
     """Return the task; an action holds for four steps of 5 ms, an episode lasts 8 s, and the robot touches the floor alone."""
-    model = g1()
-    is_floor, touches = model.geom_bodyid == 0, (model.geom_contype | model.geom_conaffinity) > 0
-    model.geom_contype[:], model.geom_conaffinity[:] = is_floor & touches, ~is_floor & touches
+    model = touching_the_floor_alone(g1())
     scene = load_scene(model, engine=engine, max_contacts=20)
     angles, speeds, heights = map(jnp.asarray, references(model))
     reach = _REACH + jnp.abs(angles - model.key_qpos[0, 7:]).max(axis=(0, 1))

@@ -333,9 +333,9 @@ def optimise_trajectory(
         schedule = np.ones(_ITERATIONS)
     problem, begin, controls, (factors,) = posed(system, cost, start, controls, key, smoother, [schedule], lower, upper)
     spread = deviations(stddev, problem)
-    given = problem, begin, controls, factors, jax.random.fold_in(key, 1), spread
+    given = problem, problem.begin(begin, controls), _At.of(factors, jax.random.fold_in(key, 1)), spread
     with traceable("cost"):
-        return (_improved if is_traced(given) else _one_by_one)(*given, num_samples)
+        return (_as_one if is_traced(given) else _one_by_one)(*given, num_samples)
 
 
 def posed(
@@ -444,33 +444,16 @@ def _iterated(
 _one_iteration = compiled(_iterated)
 
 
-@compiled
-def _improved(
-    problem: Problem,
-    start: StateVector,
-    controls: _Controls,
-    factors: Float[Array, " iterations"],
-    key: PRNGKeyArray,
-    stddev: ControlVector,
-    num_samples: int,
-) -> Plan:
-    """Return the plan, in one program."""
+def _as_one(problem: Problem, first: Search, every: _At, stddev: ControlVector, num_samples: int) -> Plan:
+    """Return the plan as a part of the program that asks for it."""
     advance = lambda search, at: _iterated(problem, search, at, stddev, num_samples)  # noqa: E731
-    return _ended(*jax.lax.scan(advance, problem.begin(start, controls), _At.of(factors, key)))
+    return _ended(*jax.lax.scan(advance, first, every))
 
 
-def _one_by_one(
-    problem: Problem,
-    start: StateVector,
-    controls: _Controls,
-    factors: Float[Array, " iterations"],
-    key: PRNGKeyArray,
-    stddev: ControlVector,
-    num_samples: int,
-) -> Plan:
+def _one_by_one(problem: Problem, search: Search, every: _At, stddev: ControlVector, num_samples: int) -> Plan:
     """Return the same plan by a program for an iteration; Ctrl-C ends with what was found, once the given plan is known."""
-    every, search, records = _At.of(factors, key), problem.begin(start, controls), []
-    for number in range(1 + len(factors)):
+    records, count = [], len(every.factor)
+    for number in range(count):
         at, before = jax.tree.map(lambda x, k=number: x[k], every), search
         one = lambda at=at, before=before: _one_iteration(problem, before, at, stddev, num_samples)  # noqa: E731
         try:
@@ -478,7 +461,7 @@ def _one_by_one(
         except KeyboardInterrupt:
             if not records[1:]:
                 raise
-            told = f"interrupted after {number - 1} of {len(factors)} iterations: the plan is the best of these"
+            told = f"interrupted after {number - 1} of {count - 1} iterations: the plan is the best of these"
             warnings.warn(told, stacklevel=3)
             break
         records.append(record)
