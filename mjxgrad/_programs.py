@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import ArrayLike
 
 from mjxgrad._interrupts import patiently
 
@@ -38,7 +39,7 @@ _FORMS: collections.OrderedDict[Any, tuple[Form, Any]] = collections.OrderedDict
 _MOST_KEPT = 64
 
 
-def parted(tree: Any, *, trusts_hash: bool = False) -> tuple[list[jax.Array], Form]:
+def parted(tree: Any, *, trusts_hash: bool = False) -> tuple[list[ArrayLike], Form]:
     """Return the arrays of a tree, and its form, the same one for all trees of equal content beside arrays.
 
     A function defined anew, as in a Python loop, has equal content if its code and all that it refers to are equal. What may
@@ -158,7 +159,7 @@ def compiled(function: _Function) -> _Function:
     """
 
     @eqx.filter_jit
-    def program(form: Form, leaves: list[jax.Array]) -> Any:
+    def program(form: Form, leaves: list[ArrayLike]) -> Any:
         args, kwargs = form(leaves)
         return function(*args, **kwargs)
 
