@@ -13,7 +13,17 @@ import numpy as np
 
 from mjxgrad._interrupts import patiently
 from mjxgrad._text import format_number, name_pairs
-from mjxgrad.checking.measure import NUM_COMPARED, STDDEVS, STEPS_COMPARED, Measured, Slope, nearest, slopes
+from mjxgrad.checking.measure import (
+    FEWEST_READINGS,
+    NUM_COMPARED,
+    STDDEVS,
+    STEPS_COMPARED,
+    Measured,
+    Slope,
+    nearest,
+    slopes,
+    unmeasured,
+)
 from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.engines import ENGINES, QUICK, Trajectory
@@ -27,7 +37,6 @@ _NUM_COMPARED, _ALIKE = 32, 1e-6  # states, and difference of a step over the la
 _NUM_INDEXED = 3  # steps of a trajectory whose indices are tried
 _MANY_PAIRS = 1000  # fewest pairs of geoms whose number is a finding
 _SPARE_STEP = 0.9
-_MOST_UNMEASURED = 4.0  # times the price of a discrete derivative, up to which a slope is taken unmeasured
 _DEGREES = 10.0  # least share of a control range and its joint's that tells of degrees, which are 57 times rad
 _OFF = 0.25  # expected error of a derivative from which it is a fault
 _ENOUGH = 32  # motions
@@ -251,6 +260,7 @@ def slope_finding(found: Sequence[Slope]) -> Finding:
     both = f"{chosen('slope')} {errors[0]}, {chosen('discrete')} {errors[1]}"
     nearer, alike = (slope.errors < discrete.errors).sum(), (slope.errors == discrete.errors).sum()
     text = f"{lead}: {both}. The slope is nearer in {nearer}" + f" and as near in {alike}" * bool(alike)
+    text += ", which is too few to choose by: a larger budget measures more" * (count < FEWEST_READINGS)
     return Finding("slope", f"{text}.", is_fault=far)
 
 
@@ -323,14 +333,13 @@ def recommend(
 ) -> Recommendation:
     """Return the recommended settings from measurements and the price of a slope in that of a discrete derivative.
 
-    Where nothing was measured, nothing speaks against the slope but its price; infinity is one that is not known.
+    Infinity is a price that is not known.
     """
     needed = [_largest_step(spring) for spring in _steps_too_long(stability)]
     timestep = float(f"{_SPARE_STEP * min(needed):.1e}") if needed else None
     if measured is None or not measured.lines:
         horizon = max(40, round(0.2 / motions.timestep))
-        gradient = "discrete" if _MOST_UNMEASURED < price < math.inf else "slope"
-        return Recommendation(gradient, "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
+        return Recommendation(unmeasured(price), "alpha_order", STDDEVS[0], horizon, timestep, None, max_contacts)
     found = slopes(measured.lines)
     touches = bool(motions.touches or motions.touching)
     best = nearest(found, price) if touches else "discrete"

@@ -53,6 +53,9 @@ _CLEAR = 0.1  # largest relative error of a usable slope
 _FEWEST_TEETH = 4
 CLOSE = 0.05
 """Largest expected error of a derivative that counts as the slope."""
+FEWEST_READINGS = 4
+"""Fewest readings that tell which derivative is nearer."""
+_MOST_UNMEASURED = 4.0  # times the price of a discrete derivative, up to which a slope is taken unmeasured
 _AT_REST = 1e-3  # share of the largest variation at any time
 _UNFELT = 1e-6  # share of the largest spread of all outcomes, or of 10⁻⁶: less is rounding
 NUM_COMPARED, STEPS_COMPARED = 256, 20
@@ -132,6 +135,11 @@ def slopes(lines: Sequence[Line]) -> tuple[Slope, ...]:
     return tuple(found)
 
 
+def unmeasured(price: int | float) -> Kind:
+    """Return the derivative to take where nothing speaks against the slope but its price; infinity is one that is not known."""
+    return "discrete" if _MOST_UNMEASURED < price < math.inf else "slope"
+
+
 def nearest(found: Sequence[Slope], price: int | float = np.inf) -> Kind:
     """Return the derivative to take: the slope, at a price in that of the discrete one, or that where it is as near.
 
@@ -139,10 +147,10 @@ def nearest(found: Sequence[Slope], price: int | float = np.inf) -> Kind:
     """
     slope, discrete = found
     gains = discrete.errors - slope.errors
-    if not gains.size:
-        return "slope"
-    if discrete.error <= CLOSE or gains.mean() <= 0:
+    if gains.size and (discrete.error <= CLOSE or gains.mean() <= 0):
         return "discrete"
+    if gains.size < FEWEST_READINGS:
+        return unmeasured(price)
     # In standard errors: a slope of four times the price or more must be nearer by two. A bias costs more than time does.
     needed = 1.0 if not np.isfinite(price) else np.clip(np.log2(price), 0.0, 2.0)
     return "slope" if gains.mean() > needed * gains.std() / np.sqrt(gains.size) else "discrete"

@@ -20,6 +20,7 @@ import jax
 import mujoco
 import numpy as np
 
+from mjxgrad._arrays import positive
 from mjxgrad._programs import is_traced
 from mjxgrad._text import Printed, aligned, format_number, format_range, name_pairs
 from mjxgrad.contact.collision import most_contacts
@@ -265,8 +266,8 @@ def check_stability(scene: Scene, *, speed: float | None = None) -> StabilityRep
         ValueError: if the speed is not positive, or the scene is batched or traced.
     """
     check_scene(scene)
-    if speed is not None and not (math.isfinite(speed) and speed > 0):
-        raise ValueError(f"speed must be positive, got {speed}; leave it out to skip these checks")
+    if speed is not None:
+        positive("speed", speed)
     model = scene.model
     leaves = (model.geom_solref, model.jnt_solref, model.opt.timestep)
     if is_traced(leaves) or np.ndim(model.geom_solref) != 2 or np.ndim(model.opt.timestep) != 0:

@@ -20,6 +20,7 @@ from mjxgrad.scene import Scene, SceneWarning, sensor
 STATES = ("qpos", "qvel", "act")
 _AROUND = 2  # rows on each side that tell a speed
 _FAR = 10.0  # times the noise by which a first row parts from an exact start that is told
+_WILD = 1e4  # m/s or rad/s, more than which nothing moves that is worth identifying
 _TURN, _BEYOND = 2 * np.pi, 0.1  # rad, more than which may be degrees; share of its range by which a joint may leave it
 
 
@@ -263,8 +264,10 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
 
 
 def doubts(scene: Scene, recording: Recording, free_start: bool | None) -> Iterator[str]:
-    """Yield sentences on what a recording is perhaps not: in radians; from the exact start that was given."""
+    """Yield sentences on what a recording is perhaps not: a motion; in radians; from the exact start that was given."""
     model = scene.mj_model
+    if (wild := _fastest(scene, recording)) > _WILD:
+        yield f"something moves at {wild:.2g} m/s or rad/s: has a simulation blown up? Leave it out, or cut it before"
     if found := in_degrees(scene, recording):
         name, (angle, low, high) = next(iter(found.items()))
         others = f" (and {len(found) - 1} more)" * (len(found) > 1)
@@ -288,6 +291,16 @@ def doubts(scene: Scene, recording: Recording, free_start: bool | None) -> Itera
             f"the first {what} is {apart[:, dof].max():.3g} times its {unit} beside the exact start that was given: "
             "is it of another pose?"
         )
+
+
+def _fastest(scene: Scene, recording: Recording) -> float:
+    """Return the largest speed that was measured, or that positions tell of (m/s, rad/s)."""
+    times, fastest = _times(recording, float(scene.model.opt.timestep)), 0.0
+    for name, signal in recording.measured.items():
+        if name in STATES[:2] and len(signal) > 1:
+            speeds = np.abs(signal if name == "qvel" else np.diff(signal, axis=0) / np.diff(times)[:, None])
+            fastest = max(fastest, float(speeds.max(where=np.isfinite(speeds), initial=0.0)))
+    return fastest
 
 
 def in_degrees(scene: Scene, recording: Recording) -> dict[str, tuple[float, float, float]]:

@@ -19,7 +19,7 @@ from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
 from mjxgrad.planning.linear_model import Analytic, Exact, Smoother
 from mjxgrad.planning.system import Cost, SceneSystem, System
-from mjxgrad.planning.trajectory import FREE, NO_COST, Course, Problem, deviations, posed, random_changes
+from mjxgrad.planning.trajectory import FREE, NO_COST, Course, Problem, deviations, listed, posed, random_changes
 from mjxgrad.rollouts import State
 
 _SAMPLES = 16  # random changes of a plan, for 15 % of a decision's time where a finger pushes a box
@@ -311,8 +311,8 @@ class Controller(Printed):
         return f"{told}: {remedy}, or a plan of {int(most)} step{'s' * (most >= 2)}"
 
     def _untouched(self) -> str:
-        places = np.flatnonzero(self._search.unmoved)
-        told = f"no control moves {self.system.named(places)}, which has a cost: where nothing touches, derivatives are zero"
+        still = listed(self.system.names, self._search.unmoved)
+        told = f"no control moves {still}, which has a cost: where nothing touches, derivatives are zero"
         more = f"num_samples={2 * self.num_samples or _SAMPLES}"
         helps = (
             f"add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take {more}"

@@ -82,9 +82,10 @@ class System(eqx.Module):
         jacobian, end = jax.jacfwd(moved, has_aux=True)(jnp.zeros(n + self.num_controls, state.dtype))
         return end, jax.jacfwd(self.difference)(end, end) @ jacobian
 
-    def named(self, coordinates: Int[np.ndarray, " some"]) -> str:
-        """Return the names of coordinates of a change."""
-        return f"coordinates {coordinates.tolist()} of the state"
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the coordinates of a change, of which several may be alike."""
+        return tuple(f"coordinate {k}" for k in range(self.num_changes))
 
     def __hash__(self) -> int:
         # `jax.jit(system.step)` needs a hash, and arrays have none.
@@ -195,11 +196,13 @@ class SceneSystem(System):
         qvel = state[nq : nq + nv]
         return State(state[:nq], qvel, state[nq + nv :], self.scene.data.time, jnp.zeros_like(qvel))
 
-    def named(self, coordinates: Int[np.ndarray, " some"]) -> str:
+    @property
+    def names(self) -> tuple[str, ...]:
         model = self.scene.mj_model
-        joints = [model.joint(int(model.dof_jntid[k % model.nv])).name for k in coordinates if k < 2 * model.nv]
-        names = ", ".join(repr(name) for name in dict.fromkeys(joints) if name)
-        return f"{names or 'some'} ({super().named(coordinates)})"
+        joints = [(model.joint(k).name, model.body(model.jnt_bodyid[k]).name) for k in range(model.njnt)]
+        own = [f"'{name}'" if name else f"the joint of '{body}'" for name, body in joints]
+        moved = [own[joint] for joint in model.dof_jntid]
+        return *moved, *(f"the speed of {name}" for name in moved), *(f"activation {k}" for k in range(model.na))
 
     def placed(self, state: StateVector) -> mjx.Data:
         """Return data that has the places of bodies, geoms and sites in a state, such as `site_xpos`, for costs."""

@@ -49,6 +49,7 @@ _PIECES, _SMALLEST = 4, 0.125  # of a random change of a plan, and the share of 
 _USUAL = 0.05  # of a control's range, and _UNLIMITED where it has none: the deviation of random changes
 _UNLIMITED = 0.1
 NO_COST = "the cost of the given controls is no finite number, though all their states are"
+_LISTED = 4  # names of coordinates in a sentence
 _ITERATIONS = 20  # unless a schedule says
 _TRUSTED = 0.8  # of what a linear model promises: where as much comes true, no random change is taken
 _KEPT = 0.2  # of what linear models promised; where less came true, random changes are advised
@@ -86,6 +87,7 @@ class Plan(eqx.Module, Printed):
         converged: whether the last model that was free to move predicts almost no further decrease; never if a coordinate is
             unmoved.
         diverged: whether the smoothed system left finite numbers, so that iterations were lost.
+        names: names of the coordinates of a change.
     """
 
     controls: _Controls
@@ -96,14 +98,14 @@ class Plan(eqx.Module, Printed):
     unmoved: Bool[Array, " n"]
     converged: Bool[Array, ""]
     diverged: Bool[Array, ""]
+    names: tuple[str, ...] = eqx.field(static=True, repr=False)
 
     def verdict(self) -> str:
         """Return one sentence on how the planning ended; on the host, for a single plan."""
         if self.unmoved.any():
             return (
-                f"nothing is touched: no control moves the coordinates {np.flatnonzero(self.unmoved).tolist()} of the state, "
-                "which have a cost, so derivatives are zero; start with controls that touch, take num_samples=32, or smooth "
-                "by Analytic"
+                f"nothing is touched: no control moves {listed(self.names, self.unmoved)}, which has a cost, so derivatives "
+                "are zero; start with controls that touch, take num_samples=32, or smooth by Analytic"
             )
         if not np.isfinite(self.cost) and np.isfinite(self.states).all():
             return f"not improved: {NO_COST}"
@@ -447,7 +449,7 @@ _one_iteration = compiled(_iterated)
 def _as_one(problem: Problem, first: Search, every: _At, stddev: ControlVector, num_samples: int) -> Plan:
     """Return the plan as a part of the program that asks for it."""
     advance = lambda search, at: _iterated(problem, search, at, stddev, num_samples)  # noqa: E731
-    return _ended(*jax.lax.scan(advance, first, every))
+    return _ended(*jax.lax.scan(advance, first, every), problem.system.names)
 
 
 def _one_by_one(problem: Problem, search: Search, every: _At, stddev: ControlVector, num_samples: int) -> Plan:
@@ -465,11 +467,11 @@ def _one_by_one(problem: Problem, search: Search, every: _At, stddev: ControlVec
             warnings.warn(told, stacklevel=3)
             break
         records.append(record)
-    return _ended(search, jax.tree.map(lambda *x: jnp.stack(x), *records))
+    return _ended(search, jax.tree.map(lambda *x: jnp.stack(x), *records), problem.system.names)
 
 
 @compiled
-def _ended(found: Search, records: _Record) -> Plan:
+def _ended(found: Search, records: _Record, names: tuple[str, ...]) -> Plan:
     """Return the plan of a search and the records of its iterations, the first of which is the given plan's."""
     start_cost, (rows, held) = records[0].cost[0], jax.tree.map(lambda x: x[1:], records)
     # What is held to the controls as they are promises nothing, either.
@@ -483,7 +485,14 @@ def _ended(found: Search, records: _Record) -> Plan:
         unmoved=found.unmoved,
         converged=(promised <= _TOLERANCE * jnp.abs(found.course.cost)) & ~found.unmoved.any(),
         diverged=~jnp.all(jnp.isfinite(rows.smoothed_cost)),
+        names=names,
     )
+
+
+def listed(names: Sequence[str], chosen: Bool[ArrayLike, " n"]) -> str:
+    """Return the chosen of some names as text, each once."""
+    found = list(dict.fromkeys(names[k] for k in np.flatnonzero(chosen)))
+    return ", ".join(found[:_LISTED]) + f" and {len(found) - _LISTED} more" * (len(found) > _LISTED)
 
 
 def _unmoved(models: LinearModel, stages: Quadratic, terminal: Quadratic, cost: _Scalar) -> Bool[Array, " n"]:

@@ -32,7 +32,7 @@ def initial_state(
     """Return the state at the scene's reference pose, at rest, or at a key frame, with the given parts replaced.
 
     The parts are those of `State`. A key frame of the file has a name or number. Where values are known, it warns about a joint
-    beyond its limits, which would push it back from the first step, and about deep penetration in a pose of the file.
+    beyond its limits, which would push it back from the first step, and about deep penetration.
 
     Raises:
         ValueError: if a part does not fit the scene's shapes, is not finite, has a zero quaternion, or there is no such key
@@ -53,7 +53,7 @@ def initial_state(
             where = f"{np.asarray(part)[bad[0]]} at {bad[0]}" + f" and {len(bad) - 1} more" * (len(bad) > 1)
             raise ValueError(f"{name} must be finite, got {where}")
         parts.append(part)
-    for message in pose_warnings(scene.model, scene.mj_model if qpos is None else None, parts[0]):
+    for message in pose_warnings(scene.model, scene.mj_model, parts[0]):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
     state = State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
     return engine_of(scene).complete(scene, state, Discrete())
@@ -71,8 +71,8 @@ def key_of(model: mujoco.MjModel, keyframe: str | int) -> int:
     raise ValueError(f"keyframe must be one of {names} in this scene, got {keyframe!r}")
 
 
-def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayLike) -> Iterator[str]:
-    """Return warnings about a known pose: joints beyond their limits and, for poses of the file, deep penetration.
+def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel, qpos: ArrayLike) -> Iterator[str]:
+    """Return warnings about a known pose: joints beyond their limits, and deep penetration.
 
     Raises:
         ValueError: if a quaternion is zero.
@@ -93,12 +93,10 @@ def pose_warnings(model: mjx.Model, of_file: mujoco.MjModel | None, qpos: ArrayL
             slack = 1e-6 * max(1.0, abs(value)) + _HARMLESS * (high - low)
             if not low - slack <= value <= high + slack:
                 yield f"{name} begins at {value:g} {unit}, beyond its range from {low:g} to {high:g} {unit}"
-    if of_file is None:
-        return
     data = mujoco.MjData(of_file)
     data.qpos[:] = pose
     mujoco.mj_fwdPosition(of_file, data)
     deepest = min(data.contact, key=lambda contact: contact.dist, default=None)
     if deepest is not None and deepest.dist < -_DEEP:
         names = " in ".join(geom_name(of_file, geom) for geom in deepest.geom[::-1].tolist())
-        yield f"{names} begins {-1e3 * deepest.dist:.3g} mm deep: give qpos or keyframe"
+        yield f"{names} begins {-1e3 * deepest.dist:.3g} mm deep: begin elsewhere, by qpos or keyframe"

@@ -470,11 +470,20 @@ def test_scatter_is_not_rewarded():
 
 
 def test_a_dear_slope_that_is_no_nearer_is_named_and_left():
-    """Nearer by 0.01 ± 0.007: enough at twice the price, by log₂ 2 = 1 standard error, and not at 46 times."""
-    slope, discrete = (Slope(kind, np.array([0.2, error]), 64) for kind, error in (("slope", 0.18), ("discrete", 0.2)))
+    """Nearer by 0.005 ± 0.004: enough at twice the price, by log₂ 2 = 1 standard error, and not at 46 times."""
+    errors = [("slope", 0.18), ("discrete", 0.2)]
+    slope, discrete = (Slope(kind, np.array([0.2, 0.2, 0.2, error]), 64) for kind, error in errors)
     assert [nearest((slope, discrete), price) for price in (1.9, 46)] == ["slope", "discrete"]
     told = price_finding({"slope": 4.6, "discrete": 0.1}, (slope, discrete), 40).text
     assert "costs 46 times as much and is no nearer beyond doubt" in told
+
+
+def test_one_reading_does_not_choose_a_dear_slope():
+    """Its spread is unknown, so that a slope that is nearer there is taken for its price, as where nothing was measured."""
+    slope, discrete = Slope("slope", np.array([0.3]), 64), Slope("discrete", np.array([0.7]), 64)
+    assert [nearest((slope, discrete), price) for price in (3, 5)] == ["slope", "discrete"]
+    assert "1 reading by 64 motions each" in (told := findings.slope_finding((slope, discrete)).text)
+    assert "too few to choose by" in told
 
 
 def test_the_answer_comes_first_with_its_sureness_and_its_price(bounce):

@@ -106,8 +106,8 @@ def test_a_search_says_what_it_does_until_it_ends_and_no_further_start_follows_o
     assert identification.outlook(cart, gear, [_noisy()]).more > 0
 
 
-def test_a_first_row_far_from_an_exact_start_and_angles_in_degrees_are_told():
-    """On a hinge from -1 to 1 rad, 57.3 times its angle fits as degrees. The start is 200 times the noise off."""
+def test_what_a_recording_is_perhaps_not_is_told():
+    """On a hinge from -1 to 1 rad, 57.3 times its angle fits as degrees. One start is 200 times the noise off, one blows up."""
     scene = mg.load_scene("""<mujoco><worldbody><body><joint name="hip" axis="0 1 0" range="-57 57"/><geom size=".1"/></body>
         </worldbody></mujoco>""")
     turn = 0.2 + 0.3 * np.sin(np.arange(20) / 5)
@@ -124,6 +124,8 @@ def test_a_first_row_far_from_an_exact_start_and_angles_in_degrees_are_told():
         texts = [str(one.message) for one in told if "undamped" not in str(one.message)]
         assert len(texts) == (said is not None)
         assert all(said in text for text in texts)
+    with pytest.warns(UserWarning, match="something moves at 5e\\+05 m/s or rad/s: has a simulation blown up"):
+        identification.outlook(scene, damping, [Recording({"qpos": turn, "qvel": 1e6 * turn}, times=one.times)])
 
 
 @pytest.mark.usefixtures("few_starts")

@@ -218,7 +218,7 @@ def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves():
     # The block costs and no control moves it; the finger, which one moves, costs nothing.
     assert plan.unmoved.tolist() == [False, True]
     assert not plan.converged
-    assert plan.verdict().startswith("nothing is touched: no control moves the coordinates [1]")
+    assert plan.verdict().startswith("nothing is touched: no control moves coordinate 1, which has")
     assert (
         str(plan)
         == f"Cost {plan.cost:.3g} from {plan.start_cost:.3g} in {plan.iterations.cost.size} iterations: {plan.verdict()}."

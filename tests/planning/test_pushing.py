@@ -19,7 +19,7 @@ PUSHER = """<mujoco><option timestep=".005"/><worldbody><geom name="floor" type=
   <position joint="x" kp="100" kv="10" ctrlrange="-1 1"/><position joint="y" kp="100" kv="10" ctrlrange="-1 1"/>
   </actuator></mujoco>"""
 GOAL, SUBSTEPS, KEY = np.array([0.15, 0.03]), 6, jax.random.key(0)
-NOTHING = "no control moves 'box' .coordinates .2.* add the distance"
+NOTHING = "no control moves 'box', which has a cost.* add the distance"
 
 
 class Push(LeastSquares):

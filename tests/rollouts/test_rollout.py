@@ -203,6 +203,8 @@ def test_a_pose_of_the_file_that_is_no_start_is_said_and_its_key_frames_are_take
     texts = [str(one.message) for one in said]
     assert any("calf begins at 0 rad" in text for text in texts)
     assert any("trunk in floor begins 80 mm deep" in text for text in texts)
+    with pytest.warns(SceneWarning, match="trunk in floor begins 50 mm deep"):
+        mg.initial_state(scene, qpos=[0, 0, 0.05, 1, 0, 0, 0, -1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         home, second = mg.initial_state(scene, keyframe="home"), mg.initial_state(scene, keyframe=1)
