@@ -2,14 +2,13 @@
 
 import copy
 from collections.abc import Sequence
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from experiments.settings import VideoSettings
 from experiments.workspace import Workspace
-from mjxgrad.rollouts.render import RenderingUnavailableError, frames, write_video
+from mjxgrad.rollouts.render import RenderingUnavailableError, frames, tile, write_video
 
 FILE = "video.mp4"
 
@@ -58,28 +57,3 @@ def with_coarse_shadows(mj_model: mujoco.MjModel) -> mujoco.MjModel:
     coarse = copy.copy(mj_model)
     coarse.vis.quality.shadowsize = min(1024, coarse.vis.quality.shadowsize)
     return coarse
-
-
-def tile(videos: Sequence[np.ndarray], captions: Sequence[str], *, columns: int) -> np.ndarray:
-    """Put videos of one size side by side, each under its caption; one that ends early keeps its last frame."""
-    length = max(len(video) for video in videos)
-    padded = [video[np.minimum(np.arange(length), len(video) - 1)] for video in videos]
-    cells = [_captioned(video, caption) for video, caption in zip(padded, captions, strict=True)]
-    cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
-    rows = [np.concatenate(cells[i : i + columns], axis=2) for i in range(0, len(cells), columns)]
-    return np.concatenate(rows, axis=1)
-
-
-def _captioned(video: np.ndarray, caption: str) -> np.ndarray:
-    """Put a band with a caption above every frame."""
-    # Pillow's own font lacks Greek letters; matplotlib brings one that has them, and Pillow.
-    import matplotlib
-    from PIL import Image, ImageDraw, ImageFont
-
-    width = video.shape[2]
-    size = max(11, width // 28)
-    band = Image.new("RGB", (width, 2 * size), (24, 28, 36))
-    draw = ImageDraw.Draw(band)
-    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
-    draw.text((width / 2, size), caption, font=font, fill=(238, 240, 244), anchor="mm")
-    return np.concatenate([np.broadcast_to(np.asarray(band), (len(video), *np.asarray(band).shape)), video], axis=1)

@@ -489,9 +489,9 @@ def _ended(found: Search, records: _Record, names: tuple[str, ...]) -> Plan:
     )
 
 
-def listed(names: Sequence[str], chosen: Bool[ArrayLike, " n"]) -> str:
+def listed(names: Sequence[str], chosen: Bool[Array, " n"]) -> str:
     """Return the chosen of some names as text, each once."""
-    found = list(dict.fromkeys(names[k] for k in np.flatnonzero(chosen)))
+    found = list(dict.fromkeys(name for name, one in zip(names, chosen.tolist(), strict=True) if one))
     return ", ".join(found[:_LISTED]) + f" and {len(found) - _LISTED} more" * (len(found) > _LISTED)
 
 

@@ -3,12 +3,14 @@
 import copy
 import functools
 import importlib
+import math
 import os
 import platform
 import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -117,6 +119,44 @@ def _moves(
     return moves if np.linalg.norm(moves, axis=-1).max() > mj_model.stat.extent else np.zeros_like(moves)
 
 
+def tile(videos: Sequence[Frames], captions: Sequence[str] = (), *, columns: int | None = None) -> Frames:
+    """Return videos of one size side by side, each under its caption; one that ends early keeps its last frame.
+
+    They stand in rows of so many columns, by default in a square or one column wider. Captions need matplotlib.
+
+    Raises:
+        ValueError: if there is no video, captions are fewer or more, or sizes differ.
+    """
+    videos = [np.asarray(video) for video in videos]
+    if not videos or len({video.shape[1:] for video in videos}) > 1 or any(video.ndim != 4 for video in videos):
+        sizes = ", ".join(str(video.shape) for video in videos) or "none"
+        raise ValueError(f"videos must have one size, each of shape (frames, height, width, 3), got {sizes}")
+    if captions and len(captions) != len(videos):
+        raise ValueError(f"captions must be {len(videos)}, one for each video, got {len(captions)}")
+    columns = math.ceil(math.sqrt(len(videos))) if columns is None else whole("columns", columns)
+    length = max(map(len, videos))
+    cells = [video[np.minimum(np.arange(length), len(video) - 1)] for video in videos]
+    cells = [_captioned(*both) for both in zip(cells, captions, strict=True)] if captions else cells
+    cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
+    rows = [np.concatenate(cells[i : i + columns], axis=2) for i in range(0, len(cells), columns)]
+    return np.concatenate(rows, axis=1)
+
+
+def _captioned(video: Frames, caption: str) -> Frames:
+    """Put a band with a caption above every frame."""
+    # Pillow's own font lacks Greek letters; matplotlib brings one that has them, and Pillow.
+    import matplotlib
+    from PIL import Image, ImageDraw, ImageFont
+
+    width = video.shape[2]
+    size = max(11, width // 28)
+    band = Image.new("RGB", (width, 2 * size), (24, 28, 36))
+    draw = ImageDraw.Draw(band)
+    font = ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
+    draw.text((width / 2, size), caption, font=font, fill=(238, 240, 244), anchor="mm")
+    return np.concatenate([np.broadcast_to(np.asarray(band), (len(video), *np.asarray(band).shape)), video], axis=1)
+
+
 def write_video(path: str | Path, video: Frames, *, fps: Number = 30.0) -> None:
     """Write frames as H.264 in MP4, with the ffmpeg of `imageio_ffmpeg`.
 
@@ -164,7 +204,9 @@ def _check(mj_model: mujoco.MjModel, positions: np.ndarray, **numbers: Number) -
         positive(name, value)
     if positions.ndim != 2 or positions.shape[1] != mj_model.nq or not len(positions):
         is_batch = positions.ndim == 3 and positions.shape[2] == mj_model.nq
-        remedy = ": draw one motion at a time, such as qpos[0]" if is_batch else ""
+        remedy = (
+            ": draw one motion at a time, such as qpos[0]; mg.render.tile puts them side by side" if is_batch else ""
+        )
         wanted = f"shape (states, nq) = (at least 1, {mj_model.nq})"
         raise ValueError(f"qpos must have {wanted}, got {positions.shape}{remedy}")
     if not np.isfinite(positions).all():

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from experiments.video import tile
-from mjxgrad.rollouts.render import RenderingUnavailableError, frames, write_video
+from mjxgrad.rollouts.render import RenderingUnavailableError, frames, tile, write_video
 from tests.processes import run_python
 
 # A white ball that slides along x, seen from a camera that looks along y: its place in the picture is its place in x.
@@ -103,6 +102,8 @@ def test_tiles_stand_in_rows_and_the_shorter_video_keeps_its_last_frame():
     assert (tiled[1, band : band + 20, :40] == 50).all()
     assert (tiled[1, band : band + 20, 40:] == 200).all()
     assert (tiled[:, band + 20 :, 40:] == 0).all()
+    assert tile([short, long]).shape == (2, 20, 80, 3)
+    assert tile([short] * 3).shape == (1, 40, 80, 3)
 
 
 def test_a_video_is_complete_or_absent(tmp_path):
