@@ -3,6 +3,7 @@
 from mjxgrad.engines.engine import Engine, Motion, Observe, PolicyFunction, Rows, Sees
 from mjxgrad.engines.mjx import MJX
 from mjxgrad.engines.mujoco import MuJoCo
+from mjxgrad.engines.multiplied import SlopeWarning
 from mjxgrad.engines.state import DivergedError, State, Trajectory
 from mjxgrad.engines.warp import Warp
 from mjxgrad.scene import Scene, SceneError
@@ -34,6 +35,6 @@ def engine_of(scene: Scene, contact: Contact = Discrete()) -> Engine:
 
 
 __all__ = [
-    "ENGINES", "QUICK", "DivergedError", "Engine", "Motion", "Observe", "PolicyFunction", "Rows", "Sees", "State", "Trajectory",
-    "engine_of",
+    "ENGINES", "QUICK", "DivergedError", "Engine", "Motion", "Observe", "PolicyFunction", "Rows", "Sees", "SlopeWarning", "State",
+    "Trajectory", "engine_of",
 ]  # fmt: skip

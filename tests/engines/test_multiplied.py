@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mjxgrad as mg
-from mjxgrad.engines.multiplied import SlopeWarning
+from mjxgrad.engines import SlopeWarning
 from tests.scenes import ASSETS
 
 BALL = """<mujoco><option timestep=".002"/><worldbody><geom type="plane" size="9 9 .1"/><body pos="0 0 .3"><freejoint/>
