@@ -308,16 +308,16 @@ def _by_modes(
     weights, label, width = every[apart], np.array(groups)[apart], np.array(widest)[apart]
     mode = weights @ scaled[index]
     to_middle = np.where(label[:, None] == label, (weights @ (centres[index] - gaps[index]))[:, None], 0.0)
-    held = np.zeros(0, int)
+    held, is_free = np.zeros(0, int), ~chosen
     while True:
-        kept = held[_independent(scaled[held], mode)]
+        kept = held[_independent(scaled[held], mode)] if held.size else held
         moves = np.linalg.pinv(np.concatenate([mode, scaled[kept]]))[:, : len(mode)]
         middles = moves @ to_middle
         reach = np.max(np.abs(scaled @ moves) * width + np.abs(scaled @ middles), axis=1)
-        crossed = np.setdiff1d(np.flatnonzero((np.abs(gaps) < reach) & ~chosen), held)
+        crossed = np.flatnonzero((np.abs(gaps) < reach) & is_free)
         if not crossed.size:
             break
-        held = np.concatenate([held, crossed])
+        held, is_free[crossed] = np.concatenate([held, crossed]), False
     ahead, own = (weights * times[index]) @ rows[index], (rows[index], gaps[index], centres[index])
     moves, middles = moves / lengths[:, None], middles / lengths[:, None]
     return Events(mode * lengths, ahead, moves, middles, width, *own, weights, index)

@@ -194,7 +194,12 @@ def _advance(
     motions, slots = np.nonzero(live)
     rows = np.repeat(course.rows[motions, t][:, None], 2, axis=1)
     rows[..., layout.motion] = flight.ends[motions, slots]
-    models = [course.models(motion, t) for motion in motions.tolist() for _ in range(2)]
+    # Pairs of a motion follow each other.
+    first = np.flatnonzero(np.diff(motions, prepend=-1))
+    counts = np.diff([*first, len(motions)]).tolist()
+    models = [
+        model for i, n in zip(first, counts, strict=True) for model in 2 * n * [course.models(int(motions[i]), t)]
+    ]
     rows = step(rows.reshape(-1, rows.shape[-1]), models).reshape(rows.shape)
     ends = rows[..., layout.motion]
     with np.errstate(invalid="ignore"):
@@ -202,11 +207,9 @@ def _advance(
     before = flight.apart[motions, slots]
     expected = (course.matrices[motions, t] @ before[..., None])[..., 0]
     off = np.linalg.norm(scale * (apart - expected), axis=-1)
-    # Pairs of a motion follow each other.
-    first = np.flatnonzero(np.diff(motions, prepend=-1))
-    for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(motions)], strict=True):
+    for begin, count in zip(first.tolist(), counts, strict=True):
         if (one := course.begun.get((int(motions[begin]), t))) is not None:
-            own = slice(begin, end)
+            own = slice(begin, begin + count)
             felt, left = before[own] @ one.felt.T, apart[own] - expected[own]
             off[own] = np.linalg.norm(scale * (left - felt @ one.apart), axis=-1)
             reach = np.abs(felt) * flight.widths[motions[own], slots[own]][:, None]
