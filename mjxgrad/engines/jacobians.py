@@ -46,7 +46,9 @@ _TOLERANCE, _ITERATIONS = 1e-16, 200
 _CONTACT_TOLERANCE = 1e-14  # m
 APART = 0.5  # of the larger side's difference, by which the two sides differ where one has a jump
 _OF_TIME = "opt.timestep"
+_ROUNDING = 1e-10  # of forces and of states
 _KINK = 0.1  # of a derivative, by which its two sides differ at most
+_BEND = 1e-3  # of a derivative, by which its sides differ at most where nothing begins or ends between
 _TOGETHER = 64  # rows whose algebra is done at once
 
 _Found = dict[str, np.ndarray]
@@ -483,9 +485,10 @@ class Worker:
             above, below = (self._read(start, done) for start in starts[column])
             found["state"][:, column] = (above - below) / (2 * WIDTH)
         for name in (one for one in found if is_other(one)):
+            middle = self._read(row)
             for column, (put, size, is_zero) in enumerate(self._changes(self.inverse, row, name)):
                 read = lambda amount, put=put: self._read(put(amount))  # noqa: E731
-                found[name][:, column] = _derivative(read, size, is_zero)
+                found[name][:, column] = _derivative(read, middle, size, is_zero)
                 put(0.0)
 
     def _by_others(self, one: _Row, names: list[str]) -> None:
@@ -493,23 +496,27 @@ class Worker:
         for name in names:
             events = one.events if moves_gaps(name) else None
             shares = np.zeros((0 if events is None else len(events.widths), one.found[name].shape[1]))
+            by_solution = one.is_explicit and name != _OF_TIME
+
+            def end(start: np.ndarray, by_solution: bool = by_solution) -> np.ndarray:
+                if by_solution:
+                    return np.concatenate(one.by.at(start, one.acceleration))
+                return self.layout.difference(self._step(one.by, start), one.after)
+
+            middle = end(one.clear)
             for column, (put, size, is_zero) in enumerate(self._changes(one.by, one.clear, name)):
                 shift = np.zeros(self.layout.nv)
                 if events is not None:
                     shares[:, column] = self._rates(put, size, events)
                     shift = -events.moves @ shares[:, column]
-                by_solution = one.is_explicit and name != _OF_TIME
 
-                def end(
-                    amount: float, put: Callable = put, shift: np.ndarray = shift, by_solution: bool = by_solution
+                def at(
+                    amount: float, put: Callable = put, shift: np.ndarray = shift, end: Callable = end
                 ) -> np.ndarray:
                     start = put(amount)
-                    start = self.layout.moved(start, amount * shift) if shift.any() else start
-                    if by_solution:
-                        return np.concatenate(one.by.at(start, one.acceleration))
-                    return self.layout.difference(self._step(one.by, start), one.after)
+                    return end(self.layout.moved(start, amount * shift) if shift.any() else start)
 
-                change = _derivative(end, size, is_zero)
+                change = _derivative(at, middle, size, is_zero)
                 put(0.0)
                 if by_solution:
                     one.raw[name][column], one.raw[f"next {name}"][column] = np.split(change, [self.layout.nv])
@@ -596,27 +603,41 @@ def _are_frames(model: mujoco.MjModel) -> bool:
     return bool(np.isin(model.sensor_type, frames).all()) and not has_cameras
 
 
-def _derivative(end: Callable[[float], np.ndarray], size: float, is_zero: bool) -> np.ndarray:
+def _derivative(end: Callable[[float], np.ndarray], middle: np.ndarray, size: float, is_zero: bool) -> np.ndarray:
     """Return the derivative by an amount. A number that is zero may be a switch, which no small amount may turn on."""
-    # Where both sides differ, the amount's own side counts if half of the amount does half as much, and nothing if not.
 
-    def at(amount: float) -> np.ndarray | None:
+    def to(amount: float) -> np.ndarray | None:
         try:
-            return end(amount)
+            return (end(amount) - middle) / amount
         except mujoco.FatalError:  # not a model that MuJoCo steps
             return None
 
-    above, below = at(size), at(-size)
-    if above is None or (below is None and not is_zero):
-        return 0.0 * end(0.0)
-    if not is_zero:
-        return (above - below) / (2 * size)
-    middle = end(0.0)
-    up, down = (above - middle) / size, None if below is None else (middle - below) / size
-    if down is not None and np.linalg.norm(up - down) <= _KINK * max(np.linalg.norm(up), np.linalg.norm(down)):
-        return 0.5 * (up + down)
-    half = (end(size / 2) - middle) / (size / 2)
-    return up if np.linalg.norm(half - up) <= _KINK * np.linalg.norm(up) else 0.0 * up
+    up, down = to(size), to(-size)
+    if is_zero:
+        if up is None or (down is not None and _differ(up, down, _KINK)):
+            # A side counts if half of the amount does half as much: its own first, and at a surface the other one.
+            sides = [x for x, sign in ((up, 1), (down, -1)) if x is not None and _is_linear(x, to(sign * size / 2))]
+            return sides[0] if sides else 0.0 * middle
+        return up if down is None else 0.5 * (up + down)
+    if up is None or down is None:
+        return 0.0 * middle
+    if np.linalg.norm(up - down) * size > _ROUNDING and _differ(up, down, _BEND):
+        # A contact begins or ends in between, or a foot starts to slip: narrower differences step over neither.
+        for width in (_NARROWER * size, _NARROWER**2 * size):
+            one, other = to(width), to(-width)
+            if one is not None and other is not None and not _differ(one, other, _BEND):
+                return 0.5 * (one + other)
+        if _differ(up, down, APART):
+            return min(up, down, key=np.linalg.norm)  # a jump, on one side however narrow the difference
+    return 0.5 * (up + down)
+
+
+def _differ(one: np.ndarray, other: np.ndarray, share: float) -> bool:
+    return bool(np.linalg.norm(one - other) > share * max(np.linalg.norm(one), np.linalg.norm(other)))
+
+
+def _is_linear(whole: np.ndarray, half: np.ndarray | None) -> bool:
+    return half is not None and bool(np.linalg.norm(half - whole) <= _KINK * np.linalg.norm(whole))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import mjxgrad as mg
+from mjxgrad.engines.jacobians import _derivative
 from mjxgrad.engines.pool import Pool
 
 # A box slides to a wall, pushed by a servo; its mass has inertia and derived constants with it.
@@ -174,3 +175,35 @@ def test_mjx_has_the_same(scene):
 def test_what_is_wrong_is_said(scene, change, values, told):
     with pytest.raises(ValueError, match=told):
         scene.with_parameters(change, values)
+
+
+SLIDE = """<mujoco><option tolerance="1e-14" iterations="200"/><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .1">
+  <joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("gap", [1e-6, 3e-7, 1e-8, 0.0, -1e-8, -1e-7, -1e-6])
+def test_a_contact_that_is_about_to_begin_or_has_just_begun_stays_as_it_is(gap):
+    """Where a body is in the file and a radius move the gap as the joint does, whose differences are far narrower."""
+    scene = mg.load_scene(SLIDE, engine="mujoco")
+
+    def speed(place, size, joint):
+        model = scene.model
+        changed = scene.with_model(
+            body_pos=model.body_pos.at[1, 2].add(place), geom_size=model.geom_size.at[1, 0].add(size)
+        )
+        state = mg.initial_state(changed, qpos=joint[None] + gap, qvel=jnp.array([-0.5]))
+        return mg.rollout(changed, state, horizon=1).qvel[-1, 0]
+
+    place, size, joint = jax.grad(speed, (0, 1, 2))(*jnp.zeros(3))
+    assert abs(joint) < 10
+    assert_allclose([place, -size], 2 * [joint], rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("at", [0.3, -0.3, 0.0])
+def test_of_a_number_whose_difference_meets_a_jump_or_a_bend_its_own_side_counts(at):
+    """A force that jumps, or bends, 0.3 of the difference's width to one side; where it jumps at once, the other side counts."""
+    beyond = lambda x: 1e-6 * at < x  # noqa: E731
+    forces = (lambda x: 2 * x + 1.0 * beyond(x), lambda x: 2 * x + 5 * (x - 1e-6 * at) * beyond(x))
+    slopes = [_derivative(lambda x, f=f: np.array([f(x)]), np.array([f(0.0)]), 1e-6, is_zero=False) for f in forces]
+    assert slopes[0] == pytest.approx(2, rel=1e-6)
+    assert slopes[1] == pytest.approx(7 if at < 0 else 2, rel=1e-6)
