@@ -621,14 +621,17 @@ def _derivative(end: Callable[[float], np.ndarray], middle: np.ndarray, size: fl
         return up if down is None else 0.5 * (up + down)
     if up is None or down is None:
         return 0.0 * middle
-    if np.linalg.norm(up - down) * size > _ROUNDING and _differ(up, down, _BEND):
+    apart = np.linalg.norm(up - down)
+    if apart * size > _ROUNDING and _differ(up, down, _BEND):
         # A contact begins or ends in between, or a foot starts to slip: narrower differences step over neither.
         for width in (_NARROWER * size, _NARROWER**2 * size):
             one, other = to(width), to(-width)
-            if one is not None and other is not None and not _differ(one, other, _BEND):
+            if one is None or other is None:
+                break
+            if not _differ(one, other, _BEND):
                 return 0.5 * (one + other)
-        if _differ(up, down, APART):
-            return min(up, down, key=np.linalg.norm)  # a jump, on one side however narrow the difference
+            if np.linalg.norm(one - other) > 0.5 / _NARROWER * apart:  # a jump, however narrow the difference
+                return min(one, other, key=np.linalg.norm)
     return 0.5 * (up + down)
 
 
