@@ -244,7 +244,7 @@ def integrate_position(
 
 
 def position_change(model: mjx.Model | mujoco.MjModel, start: _Position, end: _Position) -> _Vector:
-    """Return the velocity that moves one position to another in unit time; quaternions take the shorter turn."""
+    """Return the velocity that moves one position to another in unit time; quaternions, of any length, take the shorter turn."""
     # The inverse of `integrate_position`.
     parts = []
     for run in tree.joint_runs(model):
@@ -252,6 +252,6 @@ def position_change(model: mjx.Model | mujoco.MjModel, start: _Position, end: _P
         change = after - before
         if run.width > 1:
             turn = spatial.multiply(spatial.conjugate(before[:, -4:]), after[:, -4:])
-            change = jnp.concatenate([change[:, :-4], spatial.logarithm(turn)], axis=1)
+            change = jnp.concatenate([change[:, :-4], spatial.logarithm(spatial.normalise(turn))], axis=1)
         parts.append(change.reshape(-1))
     return jnp.concatenate(parts)

@@ -38,6 +38,8 @@ _ONE_SIDE = 1e-7  # of differences to one side: their error is in proportion
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
+# Numbers of a model that are rounding beside the others of their row, as where a file's degrees are turned; and short lengths (m).
+_BESIDE_ROW, _SHORT = 1e-6, 1e-3
 # Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
 _STEEP, _NARROWER, _WIDER = 1.0, 1 / 30, 30.0
 _NEARLY = 0.1  # of what is too steep, from which columns beside such a one are differenced, too
@@ -541,10 +543,9 @@ class Worker:
             yield from self._by_parameters(models, row)
             return
         parts = [_Numbers.of(model, name) for model in models]
-        for entry in range(parts[0].values.size):
-            value = parts[0].values[entry].item()
+        for entry, (value, size) in enumerate(zip(parts[0].values.tolist(), parts[0].sizes.tolist(), strict=True)):
             put = functools.partial(_moved, row, [(part, np.array([entry]), np.ones(1)) for part in parts])
-            yield put, 10 * WIDTH * abs(value) or WIDTH, value == 0.0
+            yield put, 10 * WIDTH * size or WIDTH, value == 0.0
 
     def _by_parameters(
         self, models: tuple[mujoco.MjModel, ...], row: np.ndarray
@@ -558,7 +559,7 @@ class Worker:
                 rates = each.reshape(parts[0].values.size, -1)[:, column]
                 if (entries := np.flatnonzero(rates)).size:
                     moved += [(part, entries, rates[entries]) for part in parts]
-                    length = np.linalg.norm(parts[0].values[entries])
+                    length = np.linalg.norm(parts[0].sizes[entries])
                     sizes.append((10 * WIDTH * length or WIDTH) / np.linalg.norm(rates[entries]))
                     is_zero &= not length
             yield functools.partial(_moved, row, moved), min(sizes, default=WIDTH), is_zero
@@ -650,11 +651,19 @@ class _Numbers:
     holder: Any
     name: str
     values: Float[np.ndarray, " entries"]
+    sizes: Float[np.ndarray, " entries"]  # their own, or of their row where that is rounding beside it
 
     @classmethod
     def of(cls, model: mujoco.MjModel, field: str) -> "_Numbers":
         holder, name = model.opt if field.startswith("opt.") else model, field.removeprefix("opt.")
-        return cls(holder, name, np.array(getattr(holder, name, []), float).reshape(-1))
+        values = np.array(getattr(holder, name, []), float)
+        sizes = np.abs(values)
+        if values.ndim > 1:
+            row = np.linalg.norm(values, axis=-1, keepdims=True)
+            sizes = np.where((sizes > 0) & (sizes < _BESIDE_ROW * row), row, sizes)
+        if field.endswith(_SHAPES):
+            sizes = np.where(sizes > 0, np.maximum(sizes, _SHORT), sizes)
+        return cls(holder, name, values.reshape(-1), sizes.reshape(-1))
 
     def move(self, entries: Int[np.ndarray, " some"], change: Float[np.ndarray, " some"]) -> None:
         """Change some of them from what they were."""

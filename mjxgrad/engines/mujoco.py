@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
@@ -178,7 +179,7 @@ def _steps(
     fixed: _Fixed, numbers: Inputs, start: Inputs, inputs: Inputs, state: State, ctrl: Float[Array, "horizon nu"],
     gradient: Gradient,
 ) -> tuple[Trajectory, Float[Array, "states _"]]:  # fmt: skip
-    is_finite = jnp.isfinite(ctrl)  # MuJoCo replaces others by zero
+    is_finite = jnp.abs(ctrl) <= mujoco.mjMAXVAL  # MuJoCo replaces others by zero
     assert state.pairs is not None
     start |= {"warmstart": state.warmstart, "flight": state.pairs.flight, "held": state.pairs.held}
     shapes = {name: (len(ctrl), *np.shape(getattr(fixed.scene.data, name))) for name in inputs}

@@ -39,9 +39,10 @@ def initial_state(
             frame.
     """
     check_scene(scene)
-    data, keys, parts = scene.data, {}, []
+    data, keys, parts, time = scene.data, {}, [], 0.0
     if keyframe is not None:
         key = key_of(scene.mj_model, keyframe)
+        time = scene.mj_model.key_time[key]
         keys = {name: getattr(scene.mj_model, f"key_{name}")[key] for name in ("qpos", "qvel", "act")}
     for name, given in (("qpos", qpos), ("qvel", qvel), ("act", act)):
         template = getattr(data, name)
@@ -55,7 +56,7 @@ def initial_state(
         parts.append(part)
     for message in pose_warnings(scene.model, scene.mj_model, parts[0]):
         warnings.warn(f"{scene.name}: {message}", SceneWarning, stacklevel=2)
-    state = State(*parts, time=jnp.zeros_like(data.time), warmstart=jnp.zeros_like(data.qvel))
+    state = State(*parts, time=jnp.full_like(data.time, time), warmstart=jnp.zeros_like(data.qvel))
     return engine_of(scene).complete(scene, state, Discrete())
 
 

@@ -10,6 +10,10 @@ import numpy as np
 PARAMETERS = "parameters"
 """Name of numbers by which those of a model are given, and, before a colon and a field's name, of the field's rates by them."""
 _PLACES = ("geom_pos", "geom_quat", "geom_size", "geom_rbound", "body_ipos", "body_iquat")
+_FRAMES = {"geom": ("geom_pos", "geom_quat"), "site": ("site_pos", "site_quat"), "body": ("body_ipos", "body_iquat")}
+_OWN_FRAME = mujoco.mjtSameFrame.mjSAMEFRAME_NONE.value
+_OF_INERTIA = (mujoco.mjtSameFrame.mjSAMEFRAME_INERTIA.value, mujoco.mjtSameFrame.mjSAMEFRAME_INERTIAROT.value)
+_SWITCHED = ("body_gravcomp", "geom_surfacevel", "geom_adhesion", "pair_adhesion")
 
 
 def with_numbers(mj_model: mujoco.MjModel, numbers: Mapping[str, Any]) -> mujoco.MjModel:
@@ -31,12 +35,30 @@ def with_numbers(mj_model: mujoco.MjModel, numbers: Mapping[str, Any]) -> mujoco
         value = value.reshape(given.shape)
         used = np.where(value == given.astype(value.dtype), given, value)
         setattr(holder, name, used if used.ndim else float(used))
+    # MuJoCo's compiler notes what no body has, for which steps do not look.
+    for name in _SWITCHED:
+        if name in numbers:
+            setattr(target, f"flg_{name.partition('_')[2]}", 1)
+    _part_frames(target, numbers)
     if any(not np.array_equal(getattr(target, name), getattr(mj_model, name)) for name in _PLACES):
         _enclose(target)
     if not np.array_equal(target.geom_margin, mj_model.geom_margin):
         target.body_margin[:] = 0.0  # by the largest of its geoms' C MuJoCo rejects bodies of several
         np.maximum.at(target.body_margin, target.geom_bodyid, target.geom_margin)
     return target
+
+
+def _part_frames(target: mujoco.MjModel, numbers: Mapping[str, Any]) -> None:
+    """Have frames that were compiled as those of their body, or of its centre of mass, looked up, where either may change."""
+    # Kinematics copies such frames; small differences of what is given move them, too.
+    is_own = {kind: any(name in numbers for name in names) for kind, names in _FRAMES.items()}
+    for kind, frames in (("geom", target.geom_sameframe), ("site", target.site_sameframe)):
+        if is_own[kind]:
+            frames[:] = _OWN_FRAME
+        elif is_own["body"]:
+            frames[np.isin(frames, _OF_INERTIA)] = _OWN_FRAME
+    if is_own["body"]:
+        target.body_sameframe[:] = _OWN_FRAME
 
 
 def _enclose(target: mujoco.MjModel) -> None:

@@ -7,7 +7,7 @@ import importlib.util
 import logging
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, get_args
 
 import equinox as eqx
@@ -175,12 +175,14 @@ class Scene(eqx.Module):
             if np.shape(value) != arrays[name].shape:
                 raise ValueError(f"{name} must have shape {arrays[name].shape} in this scene, got {np.shape(value)}")
         changed = {name: jnp.asarray(value, arrays[name].dtype) for name, value in fields.items()}
+        changed |= {name: _of_length_one(x) for name, x in changed.items() if name.endswith("_quat")}
         # Not jnp, which jit would trace.
         known = {name: np.asarray(value) for name, value in changed.items() if is_known(value)}
         for name, numbers in known.items():
             _check_numbers(name, numbers)
         if "body_mass" in known and (empty := _without_mass(self.mj_model, known["body_mass"])):
             raise ValueError(f"body_mass must leave every moving body some mass, got none for {empty}")
+        self._refuse_left_out(changed, known)
         if "wind" in fields and not has_medium(self.mj_model):
             _warn(self, "wind acts on nothing without a medium: set density or viscosity in <option>")
         is_explicit = self.model.opt.disableflags & ~self.mj_model.opt.disableflags & _EULERDAMP
@@ -192,6 +194,8 @@ class Scene(eqx.Module):
             reason = self.unsupported or f"with_model changed {' and '.join(chosen)}, which MJX does not have"
             scene = dataclasses.replace(self, more=self.more | named, unsupported=reason)
         options = {f"opt.{name}": changed.pop(name) for name in _OPTIONS if name in changed}
+        if "body_gravcomp" in changed:  # without any in the file no step looks at it
+            changed["flg_gravcomp"] = True  # pyright: ignore[reportArgumentType]
         model, derived = self.model.replace(**changed).tree_replace(options), {}  # pyright: ignore[reportArgumentType]
         if constants.CAUSES & fields.keys():
             # Only these, so that other fields stay known while the model is traced.
@@ -199,6 +203,34 @@ class Scene(eqx.Module):
         elif "geom_size" in fields:
             derived = {"geom_rbound": constants.bounding_radii(model)}  # pyright: ignore[reportArgumentType]
         return eqx.tree_at(lambda s: s.model, scene, model.replace(**derived | changed))
+
+    def _refuse_left_out(self, changed: Mapping[str, Array], known: Mapping[str, np.ndarray]) -> None:
+        """Refuse numbers of what MuJoCo's compiler, or MJX, has left out of the model; warn where values are not known yet."""
+        model = self.mj_model
+        # Of such bodies MuJoCo keeps the diagonal of the inertia matrix alone.
+        simple = np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 1))
+        for name in ("body_ipos", "body_iquat", "jnt_axis"):
+            is_of = np.isin(model.jnt_bodyid, simple) if name == "jnt_axis" else np.isin(np.arange(model.nbody), simple)
+            if name not in changed or not is_of.any():
+                continue
+            told = (
+                f"{name} of {model.body(simple[0]).name or f'body {simple[0]}'}, whose inertia was compiled as diagonal"
+            )
+            remedy = "move its centre of mass in the file, by as little as <inertial pos='1e-6 0 0' .../>"
+            if name not in known:
+                _warn(self, f"{told}, has no effect on it: {remedy}")
+            elif not np.allclose(known[name][is_of], getattr(model, name)[is_of], rtol=0, atol=_ROUNDING):
+                raise ValueError(f"{told}, cannot change: {remedy}")
+        if self.engine != "mjx":
+            return
+        for name, has in (
+            ("dof_frictionloss", "dof_hasfrictionloss"),
+            ("tendon_frictionloss", "tendon_hasfrictionloss"),
+        ):
+            is_left_out = ~np.asarray(getattr(self.model._impl, has), bool)
+            if name in known and known[name][is_left_out].any():
+                told = f"{name} that is zero in the file is left out by MJX, and cannot change"
+                raise ValueError(f'{told}: give a small one there, or take scene.with_engine("mujoco")')
 
     def with_parameters(self, change: Callable[["Scene", PyTree], "Scene"], values: PyTree) -> "Scene":
         """Return `change(scene, values)`, with derivatives by C MuJoCo along `values` alone: they cost a few steps for each.
@@ -219,18 +251,24 @@ class Scene(eqx.Module):
         if scene.engine != "mujoco":
             return scene
         flat, unravel = ravel_pytree(values)
-        own = _arrays_of(self)
+        own, before = _arrays_of(self), self.parametrisation
+        every = flat if before is None else jnp.concatenate([before.values, flat])
+        count = len(every) - len(flat)
 
         def changed(vector: Float[Array, " parameters"]) -> dict[str, Array]:
-            every = _arrays_of(change(self, unravel(vector)))
+            start = self
+            if before is not None:  # what came from others comes from them still
+                moved = vector[:count] - jax.lax.stop_gradient(before.values)
+                start = _with_arrays(self, {k: x + before.rates[k] @ moved for k, x in before.fields.items()})
+            found = _arrays_of(change(start, unravel(vector[count:])))
             # The time step decides when events are, for which whole steps are taken.
-            return {k: x for k, x in every.items() if x is not own.get(k) and k != "opt.timestep"}
+            return {k: x for k, x in found.items() if x is not own.get(k) and k != "opt.timestep"}
 
         with warnings.catch_warnings():  # which were given above
             warnings.simplefilter("ignore", SceneWarning)
-            rates = jax.jacfwd(changed)(jax.lax.stop_gradient(flat))
+            rates = jax.jacfwd(changed)(jax.lax.stop_gradient(every))
         fields = {k: x for k, x in _arrays_of(scene).items() if k in rates}
-        return dataclasses.replace(scene, parametrisation=Parametrisation(flat, fields, rates))  # pyright: ignore[reportCallIssue]
+        return dataclasses.replace(scene, parametrisation=Parametrisation(every, fields, rates))  # pyright: ignore[reportCallIssue]
 
     @property
     def ctrlrange(self) -> Float[Array, "nu 2"]:
@@ -251,10 +289,9 @@ class Scene(eqx.Module):
         Raises:
             ValueError: if the scene is batched or traced.
         """
-        numbers = numbers_of(self.model) | self.more
-        if any(isinstance(value, jax.core.Tracer) for value in numbers.values()):
+        if any(isinstance(value, jax.core.Tracer) for value in _arrays_of(self).values()):
             raise ValueError("to_mujoco needs known values, got a traced scene")
-        return with_numbers(self.mj_model, numbers)
+        return with_numbers(self.mj_model, _changed(self))
 
     def __repr__(self) -> str:
         # All its arrays would fill pages of messages.
@@ -311,6 +348,15 @@ def _check_numbers(name: str, numbers: np.ndarray) -> None:
             raise ValueError(f"{name} must {told}, got {numbers[is_none][0].tolist()}")
 
 
+def _of_length_one(quaternions: Float[Array, "*rows 4"]) -> Float[Array, "*rows 4"]:
+    """Return quaternions of length one, with the derivative of that; those of length one to rounding keep their numbers."""
+    length = jnp.linalg.norm(quaternions, axis=-1, keepdims=True)
+    unit = quaternions / jnp.where(length > 0, length, 1.0)
+    is_one = jnp.abs(length - 1) < 8 * jnp.finfo(length.dtype).eps
+    value = jnp.where(is_one, quaternions, unit)
+    return unit + jax.lax.stop_gradient(value - unit)
+
+
 def _without_mass(model: mujoco.MjModel, mass: np.ndarray) -> str:
     """Return the first body with joints that has no mass, nor has any that it carries, though the file's has; or nothing."""
     carried = mass.astype(float)
@@ -355,7 +401,7 @@ def takes_warp(mj_model: mujoco.MjModel) -> bool:
     return True
 
 
-def changed_numbers(scene: "Scene") -> dict[str, Array]:
+def _changed(scene: "Scene") -> dict[str, Array]:
     """Return the numbers of a scene's model that its C model does not have, or that are not known yet."""
 
     def is_changed(name: str, value: Array) -> bool:
@@ -363,7 +409,12 @@ def changed_numbers(scene: "Scene") -> dict[str, Array]:
         given = np.asarray(getattr(holder, name.removeprefix("opt."), value))
         return not is_known(value) or not np.array_equal(np.ravel(value), np.ravel(given).astype(value.dtype))
 
-    found = {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)} | scene.more
+    return {name: value for name, value in numbers_of(scene.model).items() if is_changed(name, value)} | scene.more
+
+
+def changed_numbers(scene: "Scene") -> dict[str, Array]:
+    """Return the same, those that come from parameters by these."""
+    found = _changed(scene)
     if (by := scene.parametrisation) is None:
         return found
     # Those that were replaced since, or came through another transformation of JAX, have derivatives of their own.
@@ -376,6 +427,15 @@ def changed_numbers(scene: "Scene") -> dict[str, Array]:
 
 def _arrays_of(scene: "Scene") -> dict[str, Array]:
     return numbers_of(scene.model) | scene.more
+
+
+def _with_arrays(scene: "Scene", arrays: Mapping[str, Array]) -> "Scene":
+    """Return a scene with other arrays in place of its own, by name, as they are."""
+    more = {name: arrays[name] for name in scene.more if name in arrays}
+    plain = {name: x for name, x in arrays.items() if name not in more and "." not in name}
+    options = {name: x for name, x in arrays.items() if name not in more and "." in name}
+    model = scene.model.replace(**plain).tree_replace(options)  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(scene, model=model, more=scene.more | more)
 
 
 def _native(model: mujoco.MjModel) -> dict[str, np.ndarray | float]:
