@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from mjxgrad._arrays import real, whole
+from mjxgrad._programs import parted
 from mjxgrad._text import Printed, format_number
 from mjxgrad.planning.iteration import LAST, PARTS, Iteration, Turn
 from mjxgrad.planning.linear_model import Analytic, Exact, Smoother
@@ -24,6 +25,7 @@ from mjxgrad.rollouts import State
 
 _SAMPLES = 16  # random changes of a plan, for 15 % of a decision's time where a finger pushes a box
 _FIRST = 10  # iterations of the first decision, and more where the others take more
+_DISTANCE = "the distance between what pushes and what is pushed"
 _LITTLE = 0.9  # of the given controls' cost: what costs more has hardly been improved
 _RECENT, _QUANTILE = 20, 0.9  # a part is expected to take what so large a share of its last times stays below
 _SHARE = 0.25  # of a deadline that linear models may take between two looks at the clock
@@ -41,7 +43,8 @@ class Controller(Printed):
     the controller is made. `print` shows what a decision is expected to take, and after the first one what decisions took.
 
     Attributes:
-        cost: cost of plans; to replace it by one with other numbers, such as a moved goal, compiles nothing.
+        cost: cost of plans; to replace it by one with other floats, such as a moved goal, compiles nothing. One that differs in
+            whole numbers or functions is refused with a `ValueError`.
         deadline: time of a decision (s), or None.
         price: seconds of each part of a decision without a deadline, as measured when the controller was made: at the scene's
             first key frame, without any at the system's origin.
@@ -118,10 +121,10 @@ class Controller(Printed):
 
     @cost.setter
     def cost(self, cost: Cost) -> None:
-        before, after = (_numbers_of(one) for one in (self._cost, cost))
-        if before != after:
+        if not _is_alike(self._cost, cost):
             raise ValueError(
-                "cost must have the form of the compiled one: make a new Controller for a cost of another form"
+                "cost must have the form of the compiled one, and differ in the values of its floats alone: "
+                "make a new Controller for a cost of another form"
             )
         self._cost = cost
 
@@ -192,7 +195,8 @@ class Controller(Printed):
                 NO_COST if is_cost else "the motion under the given controls leaves finite numbers", stacklevel=2
             )
         if is_first and np.asarray(self._search.unmoved).any() and not float(self.plan.cost) < _LITTLE * given:
-            warnings.warn(self._untouched(), stacklevel=2)
+            near = f"where the cost has {_DISTANCE}, nothing needs to be done; else add it"
+            warnings.warn(self._untouched(near), stacklevel=2)
         return np.array(self.plan.controls)[0]
 
     def _iterate(self, factors: np.ndarray, limit: float) -> None:
@@ -310,14 +314,12 @@ class Controller(Printed):
             return f"{told}: {remedy}; no plan is short enough, one of 1 step takes {_ms(one)}"
         return f"{told}: {remedy}, or a plan of {int(most)} step{'s' * (most >= 2)}"
 
-    def _untouched(self) -> str:
+    def _untouched(self, first: str) -> str:
         still = listed(self.system.names, self._search.unmoved)
-        told = f"no control moves {still}, which has a cost: where nothing touches, derivatives are zero"
-        more = f"num_samples={2 * self.num_samples or _SAMPLES}"
-        helps = (
-            f"add the distance between what pushes and what is pushed to the cost, smooth by Analytic, or take {more}"
+        told = (
+            f"no control moves {still}, which has a cost: derivatives of that cost are zero until something touches it"
         )
-        return f"{told}; {helps}"
+        return f"{told}; {first}, smooth by Analytic, or take num_samples={2 * self.num_samples or _SAMPLES}"
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self}>"
@@ -340,7 +342,9 @@ class Controller(Printed):
             return told
         is_known = not self.costs or np.isfinite(self.costs).any()
         idle = "no small change lowers the cost: begin with others" if is_known else NO_COST
-        return f"{told}. Controls are as given, since {self._untouched() if self._search.unmoved.any() else idle}"
+        if self._search.unmoved.any():
+            idle = self._untouched(f"add {_DISTANCE} to the cost")
+        return f"{told}. Controls are as given, since {idle}"
 
 
 def _listed(parts: dict[str, float]) -> str:
@@ -351,7 +355,21 @@ def _ms(seconds: float) -> str:
     return f"{format_number(1e3 * seconds)} ms"
 
 
-def _numbers_of(cost: Cost) -> tuple[Any, list[str]]:
-    """Return the structure and the shapes of a cost's numbers: what its programs are compiled for."""
-    leaves, tree = jax.tree.flatten(eqx.filter(cost, eqx.is_inexact_array_like))
-    return tree, [jax.typeof(leaf).str_short() for leaf in leaves]
+def _is_alike(cost: Cost, other: Cost) -> bool:
+    """Return whether two costs differ in the values of their floats alone: programs that are compiled for one suit the other."""
+    both = [eqx.partition(one, eqx.is_inexact_array_like) for one in (cost, other)]
+    form, other_form = ([jax.tree.structure(parts), _shapes(parts[0])] for parts in both)
+    if form != other_form:
+        return False
+    rest, other_rest = (jax.tree.leaves(parts[1]) for parts in both)
+    return all(one is two or _is_equal(one, two) for one, two in zip(rest, other_rest, strict=True))
+
+
+def _shapes(numbers: Any) -> list[str]:
+    return [jax.typeof(leaf).str_short() for leaf in jax.tree.leaves(numbers)]
+
+
+def _is_equal(one: Any, other: Any) -> bool:
+    """Return whether two leaves of costs have equal content, such as a function that is defined anew in each step."""
+    (arrays, form), (other_arrays, other_form) = (parted(x, trusts_hash=True) for x in (one, other))
+    return form is other_form and all(map(np.array_equal, arrays, other_arrays))

@@ -51,7 +51,7 @@ class Iteration:
 
         Args:
             problem: the constants of all iterations.
-            cost: the cost; `run` takes others with as many numbers.
+            cost: the cost; `run` takes others that differ in the values of floats alone.
             controls: initial controls.
             start: the state at which an iteration is measured.
             still: random changes of the controls, zeros.

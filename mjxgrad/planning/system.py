@@ -200,9 +200,9 @@ class SceneSystem(System):
     def names(self) -> tuple[str, ...]:
         model = self.scene.mj_model
         joints = [(model.joint(k).name, model.body(model.jnt_bodyid[k]).name) for k in range(model.njnt)]
-        own = [f"'{name}'" if name else f"the joint of '{body}'" for name, body in joints]
+        own = [name or f"joint of {body}" for name, body in joints]
         moved = [own[joint] for joint in model.dof_jntid]
-        return *moved, *(f"the speed of {name}" for name in moved), *(f"activation {k}" for k in range(model.na))
+        return *moved, *(f"speed of {name}" for name in moved), *(f"activation {k}" for k in range(model.na))
 
     def placed(self, state: StateVector) -> mjx.Data:
         """Return data that has the places of bodies, geoms and sites in a state, such as `site_xpos`, for costs."""
@@ -226,20 +226,35 @@ class SceneSystem(System):
     def widened(self, length: ArrayLike) -> "SceneSystem":
         """Return the system with contacts that act from a distance, by C MuJoCo's margins.
 
-        The force rises from nothing at four lengths (m), where that of normal noise has all but vanished. Geoms that touch what
-        is fixed, in the reference pose, are as they were: what stands on the floor would else hover.
+        The force rises from nothing at four lengths (m), where that of normal noise has all but vanished. MuJoCo adds
+        margins, so each geom has half of that; a contact of `<pair>` has all of it.
+
+        Geoms that touch fixed ones in the reference pose would hover. Where there are any, they and all fixed geoms are as they
+        were, and the others have all four lengths. Two of these others then begin at eight lengths, unless they have a `<pair>`:
+        no margins of geoms suit all pairs there.
         """
         model, given = self.scene.mj_model, self.scene.model
+        touching = resting(model, model.qpos0)
         is_wide = model.body_weldid[model.geom_bodyid] != 0
-        is_wide[resting(model, model.qpos0)] = False
+        is_wide[touching] = False
+        share = is_wide.astype(float) if len(touching) else np.full(model.ngeom, 0.5)
+        held = {frozenset(pair) for pair in touching.tolist()}
+        explicit = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+        is_wide_pair = np.array([frozenset(pair) not in held for pair in explicit], bool)
         reach = _REACH * jnp.asarray(length)
-        solimp = given.geom_solimp.at[:, 2].set(reach).at[:, jnp.array([0, 3, 4])].set(jnp.array([1e-4, 0.9, 3.0]))
+
+        def wide(solimp: Float[Array, "rows 5"], chosen: np.ndarray) -> Float[Array, "rows 5"]:
+            softened = solimp.at[:, 2].set(reach).at[:, jnp.array([0, 3, 4])].set(jnp.array([1e-4, 0.9, 3.0]))
+            return jnp.where(chosen[:, None], softened, solimp)
+
         return dataclasses.replace(
             self,
             scene=self.scene.with_model(
-                geom_margin=jnp.where(is_wide, given.geom_margin + reach, given.geom_margin),
-                geom_solimp=jnp.where(is_wide[:, None], solimp, given.geom_solimp),
+                geom_margin=given.geom_margin + share * reach,
+                geom_solimp=wide(given.geom_solimp, is_wide),
                 geom_solmix=jnp.where(is_wide, _ALONE * given.geom_solmix, given.geom_solmix),
+                pair_margin=given.pair_margin + is_wide_pair * reach,
+                pair_solimp=wide(given.pair_solimp, is_wide_pair),
             ),
         )
 
@@ -251,7 +266,8 @@ class SceneSystem(System):
 def resting(model: mujoco.MjModel, qpos: Float[ArrayLike, " nq"]) -> Int[np.ndarray, "contacts 2"]:
     """Return the pairs of geoms that touch in a pose, or nearly, of which one is fixed."""
     model = copy.copy(model)
-    model.geom_margin += _HAIR / 2
+    model.geom_margin += _HAIR / 2  # margins of two geoms add up, and a `<pair>` has one
+    model.pair_margin += _HAIR
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)

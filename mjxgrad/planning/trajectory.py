@@ -360,7 +360,7 @@ def posed(
         raise ValueError("system must have controls to plan, got none: give the scene actuators")
     instance("cost", cost, Cost, "one such as planning.GoalCost(...)")
     instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
-    begin = _start(system, start)
+    begin = system.origin if start is None else state_of("start", start, system)
     for message in smoother.warnings(system, begin):
         warnings.warn(message, stacklevel=3)
     sequence_of(controls, None, None, system.num_controls)
@@ -379,19 +379,17 @@ def posed(
     return Problem(system, cost, smoother, jax.random.split(key, len(controls)), lower, upper), begin, controls, factors
 
 
-def _start(system: System, start: ArrayLike | State | mujoco.MjData | None) -> StateVector:
-    """Return the first state as floats."""
-    if start is None:
-        return system.origin
+def state_of(name: str, value: ArrayLike | State | mujoco.MjData, system: System) -> StateVector:
+    """Return a state of a system as floats."""
     origin = system.origin
-    if isinstance(system, SceneSystem) and isinstance(start, State | mujoco.MjData):
-        start = jnp.concatenate([jnp.asarray(getattr(start, name)) for name in ("qpos", "qvel", "act")])
-    begin = real("start", start)
-    if begin.shape != origin.shape:
-        raise ValueError(f"start must have shape {origin.shape} in this system, got {begin.shape}")
-    if is_known(begin) and not np.isfinite(begin).all():
-        raise ValueError(f"start must be finite, got {np.asarray(begin).tolist()}")
-    return begin if jnp.issubdtype(begin.dtype, jnp.floating) else begin.astype(origin.dtype)
+    if isinstance(system, SceneSystem) and isinstance(value, State | mujoco.MjData):
+        value = jnp.concatenate([jnp.asarray(getattr(value, part)) for part in ("qpos", "qvel", "act")])
+    state = real(name, value)
+    if state.shape != origin.shape:
+        raise ValueError(f"{name} must have shape {origin.shape} in this system, got {state.shape}")
+    if is_known(state) and not np.isfinite(state).all():
+        raise ValueError(f"{name} must be finite, got {np.asarray(state).tolist()}")
+    return state if jnp.issubdtype(state.dtype, jnp.floating) else state.astype(origin.dtype)
 
 
 def per_control(name: str, value: ArrayLike, system: System, dtype: Any) -> ControlVector:
@@ -490,8 +488,8 @@ def _ended(found: Search, records: _Record, names: tuple[str, ...]) -> Plan:
 
 
 def listed(names: Sequence[str], chosen: Bool[Array, " n"]) -> str:
-    """Return the chosen of some names as text, each once."""
-    found = list(dict.fromkeys(name for name, one in zip(names, chosen.tolist(), strict=True) if one))
+    """Return the chosen of some names as text, each once and in quotation marks."""
+    found = list(dict.fromkeys(f"'{name}'" for name, one in zip(names, chosen.tolist(), strict=True) if one))
     return ", ".join(found[:_LISTED]) + f" and {len(found) - _LISTED} more" * (len(found) > _LISTED)
 
 
@@ -526,7 +524,8 @@ def backward_pass(
     """Minimise the quadratic model of the cost-to-go step by step, the last first.
 
     Models and stages have a leading axis. The change of a control is between `lower`, at most 0, and `upper`, at least 0.
-    The regularisation is added to the curvature by the controls, in units of its largest entry; it shortens the steps.
+    The regularisation is added to the curvature by the controls, in units of its largest entry, or as it is where all are zero;
+    it shortens the steps.
 
     References:
         Li, Todorov. Iterative Linear Quadratic Regulator Design for Nonlinear Biological Movement Systems. ICINCO 2004.
@@ -541,7 +540,10 @@ def backward_pass(
         gradient = stage.gradient + both.T @ value.gradient
         hessian = stage.hessian + both.T @ value.hessian @ both
         q_u, q_uu, q_ux = gradient[n:], hessian[n:, n:], hessian[n:, :n]
-        held = q_uu + regularisation * jnp.max(jnp.diag(q_uu)) * jnp.eye(len(q_u), dtype=q_u.dtype)
+        added = regularisation * jnp.max(jnp.diag(q_uu))
+        # Without curvature, as in a last step that moves speeds of no weight, there is no unit; any holds controls without slope.
+        added = jnp.where(added == 0, regularisation, added)
+        held = q_uu + added * jnp.eye(len(q_u), dtype=q_u.dtype)
         k, is_free, is_sound = minimise_in_box(held, q_u, low, high)
         K = -_solve_free(held, q_ux, is_free)
         # The exact cost-to-go of this law: its shorter forms hold only without regularisation and limits.

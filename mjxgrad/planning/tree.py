@@ -29,6 +29,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 from mjxgrad._arrays import instance, one_key, whole
 from mjxgrad.planning.linear_model import Smoother
 from mjxgrad.planning.system import ControlVector, StateVector, System
+from mjxgrad.planning.trajectory import per_control, state_of
 
 _Nodes = dict[str, Any]
 _PerChange = Float[ArrayLike, " _"]
@@ -83,12 +84,13 @@ class Tree:
             batch: samples per turn; a step of all is one call.
 
         Raises:
-            ValueError: if shapes do not fit, a number is not positive, or no coordinate matters for the goal.
+            ValueError: if shapes do not fit, the goal is not finite, a number is not positive, or no coordinate matters for the
+                goal.
         """
         instance("system", system, System, "one such as planning.SceneSystem(scene=scene)")
         instance("smoother", smoother, Smoother, "one of mg.planning, such as Exact() or Analytic(mg.Smoothing(0.01))")
         self.system, self.smoother, self.batch, dtype = system, smoother, whole("batch", batch), system.origin.dtype
-        self.goal = np.asarray(goal, dtype)
+        self.goal = np.asarray(state_of("goal", goal, system), dtype)
         given = {"tolerance": tolerance, "lower": lower, "upper": upper, "resolution": resolution}
         for name, value in given.items():
             if np.shape(value) != (system.num_changes,):
@@ -118,12 +120,18 @@ class Tree:
 
         Returns:
             The path to the node nearest to the goal; with the same key the same, unless the time was over.
+
+        Raises:
+            ValueError: if start or control do not fit the system or are not finite, or no node is allowed.
         """
         one_key(key)
         began, num_steps, turn, before = time.perf_counter() - self.compile_seconds, 0, 0, 0
         spent = lambda: time.perf_counter() - self.compile_seconds - began  # noqa: E731
         keys = jax.random.split(key, self.batch)
-        start, first = np.asarray(start, self.goal.dtype), np.asarray(control, self.goal.dtype)
+        start = np.asarray(state_of("start", start, self.system), self.goal.dtype)
+        first = np.asarray(per_control("control", control, self.system, self.goal.dtype))
+        if not np.isfinite(first).all():
+            raise ValueError(f"control must be finite, got {first.tolist()}")
         samples, controls, kinds = *(np.tile(x, (self.batch, 1)) for x in (start, first)), np.zeros(self.batch, int)
         new = self._ran(self._made, samples, controls, keys, self.goal, samples, kinds)
         nodes = {name: np.zeros((whole("capacity", capacity), *x.shape[1:]), x.dtype) for name, x in new.items()}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import gymnasium
@@ -222,6 +223,36 @@ def test_a_cost_of_another_form_needs_a_new_controller(controller):
     with pytest.raises(ValueError, match="make a new Controller for a cost of another form"):
         controller.cost = GoalCost(jnp.zeros(2), jnp.ones(2), 10.0, 0.1)
     assert controller.cost is COST
+
+
+class Measured(Cost):
+    """A function of the last state, one of whose numbers counts."""
+
+    function: Callable
+    index: int | np.ndarray
+
+    def stage(self, system, state, control):
+        return control @ control
+
+    def terminal(self, system, state):
+        return self.function(state)[self.index]
+
+
+def measured(goal, index):
+    return Measured(lambda state: (state - goal) ** 2, index)
+
+
+@pytest.mark.parametrize("index", [int, np.array])
+def test_a_cost_of_another_function_or_index_needs_a_new_controller(index):
+    """They are compiled: the old ones would go on. A function that is defined anew with equal content is the same."""
+    given = measured(1.0, index(0))
+    controller = Controller(FunctionSystem(pendulum, 2, 1), given, GIVEN)
+    for other in (measured(-1.0, index(0)), measured(1.0, index(1))):
+        with pytest.raises(ValueError, match="differ in the values of its floats alone: make a new Controller"):
+            controller.cost = other
+    assert controller.cost is given
+    controller.cost = (same := measured(1.0, index(0)))
+    assert controller.cost is same
 
 
 def test_a_start_of_whole_numbers_is_one_of_floats(controller):

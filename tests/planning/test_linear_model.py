@@ -81,6 +81,68 @@ def test_a_bottle_that_is_drawn_on_a_table_stands_there_under_widened_contacts()
     np.testing.assert_array_equal(system.widened(0.01).scene.model.geom_margin > 0, [False, False, True])
 
 
+LENGTH = 0.01
+
+
+def facing(gap, *, engine="mujoco", is_fixed=False, has_pair=False, stands=False):
+    """A ball on a rail before another one, which may be fixed; beside them a third one may stand on a floor."""
+    alone, rail = 'contype="0" conaffinity="0"' if has_pair else "", '<joint type="slide" axis="1 0 0"/>'
+    floor = '<geom type="plane" size="9 9 1"/><body pos="5 0 .1"><freejoint/><geom size=".1"/></body>'
+    return SceneSystem(
+        mg.load_scene(
+            f"""<mujoco><option gravity="0 0 0"/><worldbody>
+            <body pos="0 0 1"><joint name="a" type="slide" axis="1 0 0"/><geom name="a" size=".1" mass="1" {alone}/></body>
+            <body pos="{0.2 + gap} 0 1">{"" if is_fixed else rail}<geom name="b" size=".1" mass="1" {alone}/></body>
+            {floor if stands else ""}</worldbody>
+            <contact>{"<pair geom1='a' geom2='b'/>" if has_pair else ""}</contact><actuator><motor joint="a"/></actuator>
+            </mujoco>""",
+            engine=engine,
+        ),
+        num_substeps=5,
+    )
+
+
+@pytest.mark.parametrize(
+    ("scene", "begins"),
+    [
+        ({}, 4),
+        ({"is_fixed": True}, 4),
+        ({"has_pair": True}, 4),
+        ({"is_fixed": True, "has_pair": True}, 4),
+        ({"stands": True, "is_fixed": True}, 4),
+        ({"stands": True}, 8),
+        ({"stands": True, "has_pair": True}, 4),
+    ],
+)
+def test_widened_contacts_begin_at_four_lengths_or_eight_beside_what_stands(scene, begins):
+    """From rest: there is no damping, and no force but that of the contact."""
+    for share, is_moved in ((0.97, True), (1.03, False)):
+        system = facing(share * begins * LENGTH, **scene)
+        end = Analytic(Smoothing(LENGTH)).step(system, system.origin, CONTROL, jax.random.key(0))
+        assert (end[system.scene.model.nq] < 0) == is_moved
+
+
+@pytest.mark.parametrize("has_pair", [False, True])
+def test_widened_contacts_push_about_as_averaged_ones(has_pair):
+    """From one to three lengths away, where the push falls to a twentieth. The two laws differ by a third."""
+    model = eqx.filter_jit(lambda system: analytic(system, system.origin, CONTROL, Smoothing(LENGTH)))
+    for gap in (LENGTH, 2 * LENGTH, 3 * LENGTH):
+        by_c, by_mjx = (model(facing(gap, engine=engine, has_pair=has_pair)).B[3, 0] for engine in ("mujoco", "mjx"))
+        np.testing.assert_allclose(by_c, by_mjx, rtol=0.4)
+
+
+def test_a_pair_that_stands_is_not_widened():
+    scene = mg.load_scene(
+        """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+        <body pos="0 0 .1"><freejoint/><geom name="ball" size=".1" contype="0" conaffinity="0"/></body></worldbody>
+        <contact><pair geom1="ball" geom2="floor"/></contact></mujoco>""",
+        engine="mujoco",
+    )
+    model = SceneSystem(scene).widened(LENGTH).scene.model
+    np.testing.assert_array_equal(model.pair_margin, scene.model.pair_margin)
+    np.testing.assert_array_equal(model.pair_solimp, scene.model.pair_solimp)
+
+
 IMPEDANCE = 1e-3
 
 

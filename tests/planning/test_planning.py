@@ -116,6 +116,18 @@ def test_ctrl_c_ends_with_the_best_of_the_iterations_before(monkeypatch):
             plan(last=nothing)
 
 
+@pytest.mark.parametrize("num_controls", [1, 2])
+def test_controls_without_influence_and_weight_stay_while_the_others_reach_the_goal(num_controls):
+    """The last force moves the speed alone, which has no weight, as controls have none; a second control moves nothing at all."""
+    system = FunctionSystem(lambda x, u: jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * u[0]]), 2, num_controls)
+    cost = GoalCost(jnp.array([1.0, 0.0]), 0.0, jnp.array([1.0, 0.0]), 0.0)
+    plan = optimise_trajectory(system, cost, jnp.zeros(2), jnp.zeros((10, num_controls)), jax.random.key(0))
+    assert plan.cost < 1e-12 * plan.start_cost
+    assert plan.converged
+    np.testing.assert_array_equal(plan.controls[-1], 0.0)
+    np.testing.assert_array_equal(plan.controls[:, 1:], 0.0)
+
+
 def test_a_scenes_plan_starts_at_its_state_or_its_data():
     scene = mg.load_scene(
         """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body></worldbody>
@@ -218,7 +230,7 @@ def test_without_smoothing_nothing_is_known_of_the_block_and_nothing_moves():
     # The block costs and no control moves it; the finger, which one moves, costs nothing.
     assert plan.unmoved.tolist() == [False, True]
     assert not plan.converged
-    assert plan.verdict().startswith("nothing is touched: no control moves coordinate 1, which has")
+    assert plan.verdict().startswith("nothing is touched: no control moves 'coordinate 1', which has")
     assert (
         str(plan)
         == f"Cost {plan.cost:.3g} from {plan.start_cost:.3g} in {plan.iterations.cost.size} iterations: {plan.verdict()}."

@@ -19,7 +19,9 @@ PUSHER = """<mujoco><option timestep=".005"/><worldbody><geom name="floor" type=
   <position joint="x" kp="100" kv="10" ctrlrange="-1 1"/><position joint="y" kp="100" kv="10" ctrlrange="-1 1"/>
   </actuator></mujoco>"""
 GOAL, SUBSTEPS, KEY = np.array([0.15, 0.03]), 6, jax.random.key(0)
-NOTHING = "no control moves 'box', which has a cost.* add the distance"
+NOTHING = (
+    "no control moves 'box', which has a cost.* where the cost has the distance.* nothing needs to be done; else add it"
+)
 
 
 class Push(LeastSquares):
@@ -80,6 +82,15 @@ def test_where_nothing_is_touched_a_warning_says_what_to_do(controller, system):
     with pytest.warns(UserWarning, match=NOTHING):
         controller(np.asarray(system.origin))
     assert "Controls are as given, since no control moves 'box'" in str(controller)
+    assert "; add the distance between what pushes and what is pushed to the cost, smooth by Analytic" in str(
+        controller
+    )
+
+
+def test_coordinates_have_plain_names_and_the_unnamed_those_of_their_bodies(system):
+    assert system.names == ("x", "y", *6 * ["box"], "speed of x", "speed of y", *6 * ["speed of box"])
+    unnamed = mg.load_scene("<mujoco><worldbody><body name='cup'><joint/><geom size='.1'/></body></worldbody></mujoco>")
+    assert SceneSystem(unnamed).names == ("joint of cup", "speed of joint of cup")
 
 
 @pytest.mark.filterwarnings("ignore:no control moves")

@@ -137,3 +137,26 @@ def test_a_path_by_c_mujoco_is_its_replay_and_each_step_of_a_batch_is_one_call(m
 def test_what_does_not_fit_is_refused(wrong, told):
     with pytest.raises(ValueError, match=told):
         tree_of(Exact(), **wrong)
+
+
+@pytest.mark.parametrize(
+    ("start", "control", "told"),
+    [
+        (np.zeros(3), CONTROL, r"start must have shape \(2,\) in this system, got \(3,\)"),
+        (np.array([np.nan, 0.0]), CONTROL, r"start must be finite, got \[nan, 0.0\]"),
+        (START, np.zeros(2), r"control must be one number or have shape \(1,\), got \(2,\)"),
+        (START, np.array([np.inf]), r"control must be finite, got \[inf\]"),
+    ],
+)
+def test_a_search_from_what_is_no_state_or_control_is_refused(start, control, told):
+    with pytest.raises(ValueError, match=told):
+        tree_of(Exact()).search(start, control, jax.random.key(0), capacity=10)
+
+
+@pytest.mark.parametrize(
+    ("goal", "told"), [(np.zeros(3), r"goal must have shape \(2,\)"), (np.array([INF, 0.0]), "goal must be finite")]
+)
+def test_a_goal_that_is_no_state_is_refused(goal, told, monkeypatch):
+    monkeypatch.setitem(globals(), "GOAL", goal)
+    with pytest.raises(ValueError, match=told):
+        tree_of(Exact())
