@@ -38,7 +38,7 @@ _ONE_SIDE = 1e-7  # of differences to one side: their error is in proportion
 _SHAPES = ("size", "pos", "quat", "axis", "range", "margin", "gap", "qpos0", "vert", "data")
 _RUBBING = 1e-3  # m/s or rad/s, of differences by velocities, and by what is no position, where edges or corners touch
 _NOTHING = 1e-9  # of a displacement by one
-# Numbers of a model that are rounding beside the others of their row, as where a file's degrees are turned; and short lengths (m).
+# Numbers of a model that are rounding beside the others of their row, as where a file's degrees are turned; short lengths (m).
 _BESIDE_ROW, _SHORT = 1e-6, 1e-3
 # Over a time step. A contact of two steps, the shortest, is as steep as 1/4: steeper differences step over a jump.
 _STEEP, _NARROWER, _WIDER = 1.0, 1 / 30, 30.0

@@ -9,7 +9,7 @@ there has the derivative of one that was never interrupted.
 import functools
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -37,16 +37,16 @@ def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gr
     # Numbers are those of the scene's model that its C model does not have. The start has `time` of shape (1,), the parts of the
     # motion, and "warmstart", "flight" and "held" as in `State`; inputs have one row per step under names of `INPUTS`, `ctrl` at
     # least. All found has one row per step but "warmstart", "flight" and "held", which are those after the last.
-    pool, dtype = pool_of(scene.mj_model), start["qpos"].dtype
+    flight_shape, dtype = pool_of(scene.mj_model).flight_shape, start["qpos"].dtype
     horizon = len(inputs["ctrl"])
     shapes = {k: jax.ShapeDtypeStruct((horizon, *start[k].shape), dtype) for k in MOTION}
     shapes["warmstart"] = jax.ShapeDtypeStruct(start["qvel"].shape, dtype)
-    nothing = lambda: {"flight": jnp.zeros(pool.flight_shape, dtype), "held": jnp.zeros(NUM_SLOTS, dtype)}  # noqa: E731
+    nothing = lambda: {"flight": jnp.zeros(flight_shape, dtype), "held": jnp.zeros(NUM_SLOTS, dtype)}  # noqa: E731
 
     @jax.custom_jvp
     def call(numbers: _Arrays, start: _Arrays, inputs: _Arrays) -> dict[str, Array]:
         motion = {name: start[name] for name in ("time", *MOTION, "warmstart")}
-        return _callback(pool.run, shapes, numbers, motion, inputs) | nothing()
+        return _callback(_by_pool(scene, "run"), shapes, numbers, motion, inputs) | nothing()
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
     def _derivative(primals, tangents) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -93,9 +93,9 @@ def roll_out(scene: Scene, numbers: _Arrays, start: _Arrays, inputs: _Arrays, gr
 
 def steer(scene: Scene, start: _Arrays, law: _Arrays, num_substeps: int) -> tuple[Array, Array]:
     """Return states and controls of a feedback law in one call, see `Pool.steer`."""
-    pool, first = pool_of(scene.mj_model), law["states"][0]
+    first = law["states"][0]
     shapes = {name: jax.ShapeDtypeStruct(law[name].shape, first.dtype) for name in ("states", "controls")}
-    function = functools.partial(pool.steer, num_substeps, first.dtype)
+    function = functools.partial(_by_pool(scene, "steer"), num_substeps, first.dtype)
     found = _callback(function, shapes, changed_numbers(scene), start, law)
     return jnp.concatenate([first[None], found["states"]]), found["controls"]
 
@@ -104,7 +104,7 @@ def product(scene: Scene, start: _Arrays, inputs: _Arrays, *, gradient: Gradient
     """Return the derivative of several steps by "state" and by "ctrl" that is held, and "end", the state after them."""
     pool = pool_of(scene.mj_model)
     shapes = pool.shapes(("ctrl",), _sizes({}, inputs)) | {"end": (sum(start[name].size for name in MOTION),)}
-    function = functools.partial(pool.product, gradient=gradient)
+    function = _by_pool(scene, "product", gradient=gradient)
     return _once(scene, function, shapes, start["qpos"].dtype, changed_numbers(scene), start, inputs)
 
 
@@ -120,30 +120,30 @@ def linearise(
         "state": (1, scene.mj_model.nsensordata, size),
         "ctrl": (1, scene.mj_model.nsensordata, scene.mj_model.nu),
     }
-    function = functools.partial(pool.sense, wanted=("state", "ctrl"))
+    function = _by_pool(scene, "sense", wanted=("state", "ctrl"))
     sensed = _once(scene, function, shapes, dtype, numbers, before, inputs)
     return found["state"][0], found["ctrl"][0], sensed["state"][0], sensed["ctrl"][0]
 
 
 def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times nsensordata"]:
     """Return the readings of all sensors in states under inputs, both with an axis of times; differentiable once."""
-    pool, dtype = pool_of(scene.mj_model), states["qpos"].dtype
+    num_changes, dtype = pool_of(scene.mj_model).layout.num_changes, states["qpos"].dtype
     times, count = len(inputs["ctrl"]), scene.mj_model.nsensordata
 
     @jax.custom_jvp
     def call(numbers: _Arrays, states: _Arrays, inputs: _Arrays) -> Array:
         shapes = {"readings": jax.ShapeDtypeStruct((times, count), dtype)}
-        return _callback(pool.sense, shapes, numbers, states, inputs)["readings"]
+        return _callback(_by_pool(scene, "sense"), shapes, numbers, states, inputs)["readings"]
 
     @functools.partial(call.defjvp, symbolic_zeros=True)
     def _derivative(primals, tangents) -> tuple[Array, Array]:
         numbers, states, inputs = primals
         by_number, by_state, by_input = tangents
         given = _without_zeros({**by_input, **by_number})
-        sizes = _sizes(numbers, inputs) | {"state": pool.layout.num_changes}
+        sizes = _sizes(numbers, inputs) | {"state": num_changes}
         wanted = ("state", *given)
         shapes = {name: (times, count, sizes[name]) for name in wanted}
-        function = functools.partial(pool.sense, wanted=wanted)
+        function = _by_pool(scene, "sense", wanted=wanted)
         found = _once(scene, function, shapes, dtype, numbers, states, inputs)
 
         def in_tangent_space(qpos: Array, change: Array) -> Array:
@@ -157,13 +157,19 @@ def sense(scene: Scene, states: _Arrays, inputs: _Arrays) -> Float[Array, "times
     return call(changed_numbers(scene), dict(states), dict(inputs))
 
 
+def _by_pool(scene: Scene, method: str, **how: Any) -> Callable[..., dict[str, np.ndarray]]:
+    """Return a method of the scene's pool, looked up when it is called: programs are kept, pools and their threads are not."""
+    mj_model = scene.mj_model
+    return lambda *arguments: getattr(pool_of(mj_model), method)(*arguments, **how)
+
+
 def _maps(
     scene: Scene, numbers: _Arrays, before: _Arrays, inputs: _Arrays, flight: Array, **how: Any
 ) -> dict[str, Array]:
     pool, horizon = pool_of(scene.mj_model), len(inputs["ctrl"])
     every = pool.shapes(how["wanted"], _sizes(numbers, inputs))
     shapes = {k: v if k in ONCE else (horizon, *v) for k, v in every.items()}
-    function = functools.partial(pool.maps, **how)
+    function = _by_pool(scene, "maps", **how)
     return _once(scene, function, shapes, before["qpos"].dtype, numbers, before, inputs, flight)
 
 

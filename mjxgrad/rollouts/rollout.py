@@ -169,10 +169,16 @@ def clamped(scene: Scene, controls: Float[Array | np.ndarray, "horizon nu"]) -> 
     beyond = ((numbers < low) | (numbers > high)) & (model.actuator_ctrllimited == 1)
     if beyond.any():
         row, column = np.argwhere(beyond)[0].tolist()
-        name = model.actuator(column).name or column
+        name = actuator_of(model, column)
         reach, ends = format_number(float(numbers[row, column])), format_range(ends[column], " to ")
         told = f"{reach} in step {row}, and its ctrlrange is {ends}"
         yield f"a control of actuator {name} is {told}: MuJoCo clamps it, and it has no derivative there"
+
+
+def actuator_of(model: mujoco.MjModel, control: int) -> str | int:
+    """Return the name of a control's actuator, which may have several, or the number of one without a name."""
+    actuator = int(np.searchsorted(model.actuator_ctrladr, control, side="right")) - 1
+    return model.actuator(actuator).name or actuator
 
 
 def sequence_of(

@@ -233,3 +233,13 @@ def test_no_double_precision_crosses_a_callback_whole():
     called = [line for line in lines if "callback" in line]
     assert called
     assert not any("xf64>" in line or "xi64>" in line for line in called)
+
+
+def test_a_control_is_named_by_its_actuator_which_may_have_several():
+    scene = mg.load_scene(
+        """<mujoco><worldbody><body><joint name="h" damping=".1"/><geom pos=".3 0 0" size=".1"/></body></worldbody><actuator>
+        <pid joint="h" kp="5" kv=".3"/><motor name="m" joint="h" ctrlrange="-1 1"/></actuator></mujoco>""",
+        engine="mujoco",
+    )
+    with pytest.warns(SceneWarning, match="a control of actuator m is 2 in step 0"):
+        mg.rollout(scene, mg.initial_state(scene), jnp.full((1, 3), 2.0))
