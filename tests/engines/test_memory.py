@@ -1,7 +1,6 @@
 """What C MuJoCo cannot do for want of memory is a warning, and no number."""
 
 import gc
-import os
 from pathlib import Path
 
 import jax
@@ -10,6 +9,7 @@ import pytest
 
 import mjxgrad as mg
 
+TASKS = Path("/proc/self/task")
 BOXES = "".join(
     f'<body pos="0 0 {0.1 + 0.19 * i}"><freejoint/><geom type="box" size=".1 .1 .1"/></body>' for i in range(6)
 )
@@ -30,13 +30,13 @@ def test_a_derivative_for_which_the_file_leaves_no_memory_is_no_number_and_said_
     assert jnp.isnan(slopes).all()
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads of C++ are counted by Linux")
+@pytest.mark.skipif(not TASKS.is_dir(), reason="threads of C++ are counted by Linux")
 def test_threads_of_scenes_that_are_no_longer_used_end():
     """Programs are kept, but pools of threads only for the last few scenes: eighteen have as many threads as nine."""
     counts = []
     for number in range(18):
         scene = mg.load_scene(XML.replace("<body pos", f'<site pos="0 0 {number}"/><body pos', 1), engine="mujoco")
         mg.rollout(scene, mg.initial_state(scene), horizon=1)
-        counts.append(len(os.listdir("/proc/self/task")))
+        counts.append(len(list(TASKS.iterdir())))
     gc.collect()
-    assert len(os.listdir("/proc/self/task")) <= counts[9] + 2
+    assert len(list(TASKS.iterdir())) <= counts[9] + 2
