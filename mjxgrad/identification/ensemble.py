@@ -27,7 +27,8 @@ from mjxgrad.rollouts import DivergedError
 MISFIT = 1.5
 _MOTIONS, _PER_NUMBER = 192, 8  # motions of an ensemble at least, and for each unknown of a window
 _MORE = 4  # times as many motions at most
-EXPECTED, _MOST = 15, 16  # ensembles of the first size that a fit takes, about; ensembles of any size
+EXPECTED, MOST = 15, 16  # ensembles of the first size that a fit takes, about; ensembles of any size
+LARGEST = (MOST + 1) * _MORE  # what a fit takes at most, in ensembles of the first size; one more tries the intervals
 _NARROWER, _WIDER = 0.25, 2.0  # widths that are kept from before; where the mean has missed
 _APART = 2.0  # standard errors by which the next motions differ: chatter grows with it, so one would shrink to a cell
 # Factors of its variance; standard errors of a sum of squares beyond which it is more.
@@ -58,8 +59,8 @@ class Ensemble(NamedTuple):
 
 
 _Product = Callable[[np.ndarray], np.ndarray]
-Say = Callable[[Ensemble, float, int, float], None]
-"""Function of the best ensemble so far, and of the last one's sum of squares, motions, and motions ahead, about."""
+Say = Callable[[Ensemble, float, int, tuple[float, float]], None]
+"""Function of the best ensemble so far, and of the last one's sum of squares, motions, and motions ahead, about and at most."""
 
 
 def size(columns: int) -> int:
@@ -131,13 +132,14 @@ def fit(
         if best is None or found.is_settled or found.squares <= max(best.squares, most):
             best = found
         is_settled = found.is_settled or (is_short and is_late)
-        is_last = is_settled or index == _MOST
+        is_last = is_settled or index == MOST
         if is_last:
             best = best._replace(is_settled=is_settled)
             errors = _tried(model, motions, before.draw(used, rng, box), noise, chatter)
             best = best._replace(factors=best.factors / max(1.0, float(np.quantile(errors, 0.95)) / _HALF_WIDTH))
         ahead = num + max((_AVERAGED - len(ends)) * num, 0 if ends else EXPECTED * fewest - spent)
-        say(best, misfit, used, 0.0 if is_last else float(min(ahead, (_MOST - index + 1) * num)))
+        most_ahead = 0 if is_last else (MOST - index + 1) * _MORE * fewest
+        say(best, misfit, used, (float(min(ahead, most_ahead)), float(most_ahead)))
         if is_last:
             return best
 

@@ -5,8 +5,9 @@ import dataclasses
 import difflib
 import os
 import re
+import warnings
 import zipfile
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -17,7 +18,7 @@ from mjxgrad._text import write
 from mjxgrad.identification import parameters
 from mjxgrad.identification.parameters import Parameter
 from mjxgrad.identification.recording import Recording, coordinates
-from mjxgrad.scene import Scene
+from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.scene.scene import numbers_of
 
 _SOFTNESS = ("stiffness", "damping_ratio", "width")
@@ -25,6 +26,7 @@ _NAMED = ("mass", "damping", "armature", "friction_loss", "gear", "gains")
 KINDS = ("mass", "inertia", "friction", *_SOFTNESS, *_NAMED[1:], "delay")
 """Kinds of parameters that `parameter` knows."""
 _Sizes = Mapping[str, float]  # of noise
+_LIKE = 0.75  # similarity from which an unknown column is perhaps one of the scene's
 _SMALLEST_SIZE = 0.1  # share of the largest column of a kind, the least scale of any column: smaller motion is noise
 
 
@@ -100,6 +102,7 @@ def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tu
     if late := np.flatnonzero(~(np.diff(times) > 0)).tolist():
         raise ValueError(f"time in {path} must increase, got {times[late[0]]:g}, then {times[late[0] + 1]:g}")
     found: dict[str, np.ndarray] = {}
+    told: set[tuple[str, int]] = set()  # signals and indices that have a column
     for name, column in columns.items():
         place = places.get(name, ())
         if len(place) > 1:
@@ -113,14 +116,10 @@ def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tu
             continue
         _, signal, index, width = place[0]
         found.setdefault(signal, np.full((len(times), width), np.nan))[:, index] = column
+        told.add((signal, index))
     controls = found.pop("ctrl", np.full((len(times), scene.model.nu), np.nan))
-    missing = ~np.isfinite(controls)
-    if bad := np.flatnonzero(missing.any(axis=0)).tolist():
-        names = ", ".join(scene.mj_model.actuator(i).name or f"[{i}]" for i in bad)
-        names += "".join(f" (is it {one}?)" for one in difflib.get_close_matches(names, unknown, 1))
-        row = int(missing[:, bad].any(axis=1).argmax())
-        lacks = f"it lacks {names}" + f" from {times[row]:g} s" * (not missing[:, bad].all())
-        raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; {lacks}")
+    if faults := list(_faults(scene, controls, times, told, unknown)):
+        raise ValueError(f"{path} must have the control of every actuator in every row, ctrl:name; {'; '.join(faults)}")
     if not found:
         near = [m for name in unknown for m in difflib.get_close_matches(name, places, 1)]
         given = (", ".join(unknown) or "none") + f"; did you mean {', '.join(near)}?" * bool(near)
@@ -128,9 +127,29 @@ def recording(scene: Scene, path: str | Path, noise: _Sizes | None = None) -> tu
     scale = {name: _size(scene.mj_model, name, value) for name, value in found.items()}
     if noise:
         scale = _stated(scene, found, noise, str(path))
+    for name in unknown:
+        free = [one for one, place in places.items() if place[0][1:3] not in told]
+        for near in difflib.get_close_matches(name, free, 1, _LIKE):
+            text = f"{path} has a column {name}, which is not of this scene and is left out; did you mean {near}?"
+            warnings.warn(text, SceneWarning, stacklevel=2)
     at = times - times[0]
     driven = {"controls": controls, "control_times": at} if scene.model.nu else {}
     return Recording(found, times=at, noise=scale, knows_noise=bool(noise), name=str(path), **driven), tuple(unknown)
+
+
+def _faults(
+    scene: Scene, controls: np.ndarray, times: np.ndarray, told: Container[tuple[str, int]], unknown: Sequence[str]
+) -> Iterator[str]:
+    """Yield what controls lack: columns, with what they are perhaps called instead, or numbers in them."""
+    names, missing = column_names(scene), ~np.isfinite(controls)
+    for i in np.flatnonzero(missing.any(axis=0)).tolist():
+        name, row = names["ctrl", i].removeprefix("ctrl:"), int(missing[:, i].argmax())
+        if ("ctrl", i) in told:
+            yield f"its column {name} has no finite number in row {row + 1}, at {times[row]:g} s"
+        else:
+            yield f"it lacks {name}" + "".join(
+                f" (is it {one}?)" for one in difflib.get_close_matches(name, unknown, 1)
+            )
 
 
 def _read(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
@@ -177,12 +196,16 @@ def _read_csv(path: Path, known: Container[str]) -> dict[str, np.ndarray]:
     for line, row in rows:
         if len(row) != len(names):
             raise ValueError(f"line {line} has {len(row)} cells, not {len(names)}")
-        try:
-            cells = zip(names, row, strict=True)
-            numbers.append([float(cell) if cell.strip() and name in known else np.nan for name, cell in cells])
-        except ValueError as error:
-            raise ValueError(f"line {line}: {error}") from None
+        cells = zip(names, row, strict=True)
+        numbers.append([_number(name, cell, line) if name in known else np.nan for name, cell in cells])
     return dict(zip(names, np.reshape(numbers, (len(rows), len(names))).T, strict=True))
+
+
+def _number(name: str, cell: str, line: int) -> float:
+    try:
+        return float(cell) if cell.strip() else np.nan
+    except ValueError:
+        raise ValueError(f"{name} in line {line} is no number: {cell!r}") from None
 
 
 def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]:
@@ -193,9 +216,13 @@ def _places(model: mujoco.MjModel) -> dict[str, list[tuple[str, str, int, int]]]
         name = model.joint(i).name
         own.append(("qpos", name, range(first, end), model.nq))
         own.append(("qvel", name, np.flatnonzero(model.dof_jntid == i), model.nv))
-    for i, first, count in zip(range(model.nu), model.actuator_actadr, model.actuator_actnum, strict=True):
+    for i in range(model.nactuator):
         name = model.actuator(i).name
-        own += [("ctrl", name, [i], model.nu), ("act", name, range(first, first + count), model.na)]
+        for kind, first, count, width in (  # of controls a pid has several
+            ("ctrl", model.actuator_ctrladr[i], model.actuator_ctrlnum[i], model.nu),
+            ("act", model.actuator_actadr[i], model.actuator_actnum[i], model.na),
+        ):
+            own.append((kind, name, range(first, first + count), width))
     own += [("sensor", model.sensor(i).name, range(n), int(n)) for i, n in enumerate(model.sensor_dim)]
     for kind, name, indices, width in own:
         for i, index in enumerate(indices):

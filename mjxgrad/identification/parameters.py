@@ -78,6 +78,12 @@ class Parameter:
             given = f"{self.lower.tolist()}, {self.nominal.tolist()}, {self.upper.tolist()}"
             raise ValueError(f"lower, nominal and upper must increase, nominal within them, got {given}")
 
+    def __repr__(self) -> str:
+        shown = (("nominal", self.nominal), ("lower", self.lower), ("upper", self.upper))
+        text = lambda x: np.array2string(x, formatter={"float_kind": "{:.4g}".format}, max_line_width=300)  # noqa: E731
+        numbers = [f"{name}={text(value)}" for name, value in shown]
+        return f"Parameter({', '.join(numbers)}, unit={self.unit!r})"
+
 
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
@@ -422,7 +428,7 @@ def inertia(scene: Scene, body: str) -> Parameter:
     $e^{2 \alpha}$, and $t$ the centre of mass.
 
     Raises:
-        ValueError: if there is no such body, or a flat body makes a logarithm infinite.
+        ValueError: if there is no such body, a flat body makes a logarithm infinite, or its inertia was compiled as diagonal.
 
     References:
         Rucker, Wensing. Smooth parameterization of rigid-body inertia. IEEE Robotics and Automation Letters 7(2), 2022.
@@ -433,6 +439,9 @@ def inertia(scene: Scene, body: str) -> Parameter:
         return {name: getattr(model, name).at[index].set(part) for name, part in parts.items()}
 
     index = _indices(scene, _Object.mjOBJ_BODY, body)[0]
+    if scene.mj_model.body_simple[index] and scene.mj_model.body_dofnum[index] > 1:
+        told = f"inertia of {body}, which was compiled as diagonal, cannot change"
+        raise ValueError(f"{told}: move its centre of mass in the file, as by <inertial pos='1e-6 0 0' .../>")
     names = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
     fields = [np.asarray(getattr(scene.model, name), float)[index] for name in names]
     nominal = logarithms(second_moments(*fields))

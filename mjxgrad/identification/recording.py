@@ -13,14 +13,17 @@ from jaxtyping import Float, Int
 from mjxgrad._arrays import instance, positive, real
 from mjxgrad._mjx import mjx
 from mjxgrad.bodies.tree import joint_runs
+from mjxgrad.engines import engine_of
 from mjxgrad.rollouts import State, initial_state
 from mjxgrad.rollouts.rollout import clamped
 from mjxgrad.scene import Scene, SceneWarning, sensor
+from mjxgrad.stepping import Discrete
 
 STATES = ("qpos", "qvel", "act")
 _AROUND = 2  # rows on each side that tell a speed
 _FAR = 10.0  # times the noise by which a first row parts from an exact start that is told
 _WILD = 1e4  # m/s or rad/s, more than which nothing moves that is worth identifying
+_SAME = 0.01  # of a time step, within which two times are one: they may be given with seven digits
 _TURN, _BEYOND = 2 * np.pi, 0.1  # rad, more than which may be degrees; share of its range by which a joint may leave it
 
 
@@ -32,7 +35,8 @@ class Recording:
         measured: measurements by sensor name, or as "qpos", "qvel" or "act": one row per time, NaN for none.
         controls: the controls, one row per time step of the scene or per entry of `control_times`; None without actuators.
         times: times of the measurements from the start (s), increasing; None for one at each state.
-        control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step.
+        control_times: times of the controls (s), which are then interpolated linearly; None for one row per time step. They
+            reach over the whole motion; the first and the last row may be held for one interval.
         noise: standard deviation of each signal in its own unit, one number or one per column; "qpos" has one per velocity
             (m, rad). The default is 1.
         start: the state at time 0; None for what was measured then, else the scene's pose, at rest.
@@ -61,7 +65,8 @@ class Recording:
             if (value := getattr(self, name)) is None:
                 continue
             value = np.asarray(real(f"{name} {of}", value), float)
-            if value.ndim not in ((1, 2) if name == "controls" else (1,)) or not np.isfinite(value).all():
+            is_rows = value.ndim in ((1, 2) if name == "controls" else (1,)) and len(value) > 0
+            if not (is_rows and np.isfinite(value).all()):
                 raise ValueError(f"{name} {of} must be finite, one row per time, got {value}")
             if name != "controls" and (np.any(np.diff(value) <= 0) or np.any(value < 0)):
                 raise ValueError(f"{name} {of} must increase from 0 or later, got {value}")
@@ -89,6 +94,12 @@ class Recording:
             if noise.ndim > 1 or not (noise > 0).all():
                 raise ValueError(f"noise of {name} {of} must be positive, or inf for no weight, got {value}")
 
+    def __repr__(self) -> str:
+        parts = [f"{name} {value.shape}" for name, value in self.measured.items()]
+        parts += [f"controls {np.shape(self.controls)}" if self.controls is not None else "no controls"]
+        parts += [f"{float(self.times[-1]):.4g} s"] if self.times is not None else ["one row per time step"]
+        return f"Recording({self.name!r}: {', '.join(parts)})"
+
     def cut(self, duration: float, timestep: float) -> list["Recording"]:
         """Return windows of a duration (s) at the scene's time step (s), each from a measured state; the rest is dropped.
 
@@ -97,7 +108,7 @@ class Recording:
         rows, for joints of one number each.
 
         Raises:
-            ValueError: if positions were not measured, no window fits, or a number is not positive.
+            ValueError: if positions were not measured, no window fits, controls are missing, or a number is not positive.
         """
         if "qpos" not in self.measured:
             raise ValueError(f"{self.name} must have measured qpos to be cut, got {sorted(self.measured)}")
@@ -115,18 +126,27 @@ class Recording:
             measured["qvel"] = (places[1] - places[0]) / (last - first)[:, None]
             noise["qvel"] = 1 / half * np.broadcast_to(noise.get("qpos", 1.0), measured["qpos"].shape[1:])
         controls, at = self.controls, self.control_times
-        if controls is not None and at is None:
-            at = timestep * np.arange(len(controls))
+        if controls is not None:
+            at = timestep * np.arange(len(controls)) if at is None else np.asarray(at, float)
+            _check_covered(self, at, times[-1], timestep)
         windows = []
         for begin in begins:
             rows = np.flatnonzero((times >= begin - timestep / 2) & (times <= begin + duration + timestep / 2))
+            if len(rows) < 2:  # in a gap, where nothing follows a start
+                continue
             own = {name: value[rows] for name, value in measured.items()}
             if "qvel" not in self.measured:  # the start's alone counts: others follow from places
                 own["qvel"] = np.where(np.arange(len(rows))[:, None] == 0, own["qvel"], np.nan)
-            start, name, after = times[rows[0]], f"{self.name} from {times[rows[0]]:g} s", times[rows] - times[rows[0]]
-            kept = np.zeros(0, bool) if at is None else at - start > -timestep / 2
-            given = (None, None) if at is None else (np.asarray(controls)[kept], np.maximum(at[kept] - start, 0))
-            windows.append(Recording(own, given[0], after, given[1], noise, None, name, self.knows_noise))
+            (start, end), name = times[rows[[0, -1]]], f"{self.name} from {times[rows[0]]:g} s"
+            given = None, None
+            if controls is not None and at is not None:
+                # A window's ends lie between two rows of controls, as its steps do.
+                inner = at[(at > start + _SAME * timestep) & (at < end - _SAME * timestep)]
+                moments = np.unique([start, *inner, end])
+                given = _interpolated(moments, at, controls), moments - start
+            windows.append(Recording(own, given[0], times[rows] - start, given[1], noise, None, name, self.knows_noise))
+        if not windows:
+            raise ValueError(f"duration must be that of two rows of {self.name} at least, got {duration:g} s")
         return windows
 
 
@@ -148,7 +168,7 @@ def stack(scene: Scene, recordings: Sequence[Recording]) -> Windows:
     """Return the recordings of a scene as a batch.
 
     Raises:
-        ValueError: if controls or signals do not have the scene's shapes, or measurements go on after the controls.
+        ValueError: if controls or signals do not have the scene's shapes, or measurements go beyond the controls.
     """
     timestep = float(scene.model.opt.timestep)
     steps = [_num_steps(one, timestep) for one in recordings]
@@ -254,7 +274,8 @@ def start_of(scene: Scene, recording: Recording, times: np.ndarray) -> State:
     if recording.start is not None:
         if any(getattr(recording.start, name).shape != getattr(scene.data, name).shape for name in STATES):
             raise ValueError(f"start of {recording.name} must be a state of this scene, of mg.initial_state")
-        return recording.start
+        # By the engine that simulates, which may be another than the state's.
+        return engine_of(scene).complete(scene, dataclasses.replace(recording.start, pairs=None), Discrete())
     first = {name: recording.measured[name][0] for name in STATES if name in recording.measured and times[0] == 0}
     whole = {name: np.where(np.isfinite(row), row, getattr(scene.data, name)) for name, row in first.items()}
     with warnings.catch_warnings():
@@ -333,6 +354,22 @@ def _controls(scene: Scene, recording: Recording, num_steps: int, timestep: floa
     for text in clamped(scene, controls):
         warnings.warn(f"{scene.name}: in {name}, {text}", SceneWarning, stacklevel=4)
     if recording.control_times is not None:
-        at = timestep * np.arange(num_steps)
-        return np.column_stack([np.interp(at, recording.control_times, column) for column in controls.T])
+        at = np.asarray(recording.control_times, float)
+        _check_covered(recording, at, _times(recording, timestep)[-1], timestep)
+        return _interpolated(timestep * np.arange(num_steps), at, controls)
     return np.pad(controls[:num_steps], ((0, max(0, num_steps - len(controls))), (0, 0)), mode="edge")
+
+
+def _check_covered(recording: Recording, at: np.ndarray, end: float, timestep: float) -> None:
+    """Refuse controls that are missing for more than one interval at the beginning or the end of a motion."""
+    interval = float(np.median(np.diff(at))) if len(at) > 1 else timestep
+    if max(at[0], end - at[-1]) > interval + _SAME * timestep:
+        wanted, given = f"0 to {end:g} s but for one interval, {interval:.3g} s", f"{at[0]:g} to {at[-1]:g} s"
+        raise ValueError(f"controls of {recording.name} must reach from {wanted}, got {given}")
+
+
+def _interpolated(moments: np.ndarray, at: np.ndarray, controls: Any) -> np.ndarray:
+    """Return the controls at other times, linear between their rows; the first and the last row are held."""
+    rows = np.asarray(controls, float)
+    columns = [np.interp(moments, at, column) for column in rows.reshape(len(at), rows[0].size).T]
+    return np.reshape(columns, (len(columns), len(moments))).T

@@ -56,9 +56,8 @@ class Outlook(Printed):
     Attributes:
         coordinates: bounds and names.
         told: the fields of `statistics`: intervals for noise as stated and contacts that do not chatter.
-        seconds: duration of a search, about.
-        more: seconds more, about, where that leaves more than noise: then other starts are compared.
-        num_motions: motions of all windows that it takes, about.
+        seconds: duration of a search, about and at most, on a machine as busy as now. Ensembles grow where chatter asks for it.
+        more: seconds more, likewise, where that leaves more than noise: then other starts are compared.
         num_windows: windows, each of `num_steps` steps.
         num_steps: steps of a window.
         is_rugged: whether contacts chatter already at the nominal values.
@@ -68,9 +67,8 @@ class Outlook(Printed):
 
     coordinates: Coordinates
     told: dict[str, Any]
-    seconds: float
-    more: float
-    num_motions: int
+    seconds: tuple[float, float]
+    more: tuple[float, float]
     num_windows: int
     num_steps: int
     is_rugged: bool = False
@@ -91,8 +89,8 @@ class Outlook(Printed):
         """Say the price, and what the recordings tell at the nominal values."""
         count = self.num_windows
         windows = f"{count} recording{'s' * (count > 1)} of {self.num_steps} steps"
-        price = f"About {duration(self.seconds)}: {self.num_motions} motions of {windows}"
-        price += f"; {duration(self.more)} more where other starts must be compared."
+        price = f"About {durations(self.seconds).removeprefix('about ')} for {windows}"
+        price += f"; {durations(self.more)} more where other starts must be compared."
         lost = [*self.told["without_effect"], *(" with ".join(one) for one in self.told["inseparable"])]
         told = (
             f"At the first values not told: {'; '.join(lost)}."
@@ -106,7 +104,7 @@ class Outlook(Printed):
         apart = [_without_effect(one) for one in self.told["inseparable"]]
         return "\n".join([price, told, *(f"  {line}" for line in aligned(self.rows())), *apart])
 
-    __str__ = summary
+    __str__ = __repr__ = summary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,7 +227,7 @@ class Identification(Printed):
         warnings = [f"\n{line}" for line in self.warnings()]
         return "\n".join([f"{head}, {self.stopped.value}.", f"{rms}.", "", *aligned(self.rows()), *warnings])
 
-    __str__ = summary
+    __str__ = __repr__ = summary
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return the values as a table of text, header first: name, value, interval, start, bounds, and what it goes with."""
@@ -385,6 +383,13 @@ def _partners(told: dict[str, Any], coordinates: Coordinates) -> list[str]:
         index = [names.index(name) for name in combination]
         related[np.ix_(index, index)] = ~np.eye(len(index), dtype=bool)
     return [", ".join(np.array(names)[row].tolist()) for row in related]
+
+
+def durations(seconds: tuple[float, float]) -> str:
+    """Return times, about and at most, in words: as a range, or as one if they are equal; a second at least."""
+    least, most = (duration(max(x, 1.0)) for x in seconds)
+    (number, unit), other = least.split(" "), most.split(" ")[1]
+    return f"about {least}" if least == most else f"{number if unit == other else least} to {most}"
 
 
 def _percent(shares: np.ndarray) -> str:

@@ -8,6 +8,7 @@ Where the sum of squares is rugged at its least value, the values are those of a
 """
 
 import contextlib
+import functools
 import math
 import time
 import warnings
@@ -18,15 +19,15 @@ import numpy as np
 from jaxtyping import Float
 
 from mjxgrad._arrays import function, instance, whole
-from mjxgrad._text import duration, paced
-from mjxgrad.identification.ensemble import EXPECTED, MISFIT, Ensemble, algebra, fit
+from mjxgrad._text import paced
+from mjxgrad.identification.ensemble import EXPECTED, LARGEST, MISFIT, MOST, Ensemble, algebra, fit
 from mjxgrad.identification.ensemble import outlook as ensemble_outlook
 from mjxgrad.identification.ensemble import size as ensemble_size
 from mjxgrad.identification.motions import AT_ONCE, Motions
 from mjxgrad.identification.normal import distinct, factors_of, solved, split
 from mjxgrad.identification.parameters import Parameter, check_entries
 from mjxgrad.identification.recording import Recording, Windows, after_start, doubts, spread, stack
-from mjxgrad.identification.result import Identification, Outlook, Stopped, exceeds_noise, statistics
+from mjxgrad.identification.result import Identification, Outlook, Stopped, durations, exceeds_noise, statistics
 from mjxgrad.rollouts import DivergedError
 from mjxgrad.scene import Scene, SceneWarning
 from mjxgrad.stepping import Contact
@@ -106,9 +107,10 @@ def identify(
         contact: as in `rollout`. None is MuJoCo's motion, by C MuJoCo, which recordings by MuJoCo need, for the intervals do
             not cover the error of another one. `mg.Onset()` is a smoother motion, for recordings of real things.
         max_steps: largest number of derivatives; motions of an ensemble are not counted.
-        log: called as `log(step, {"rms": ..., "share": ..., "seconds": ..., "motions": ..., "start": ..., "starts": ...})`
-            after each derivative or ensemble; step 0 is the nominal motion. The share of the motions was simulated, and the
-            seconds are left, about. An rms is of one motion, or of the mean of many over the covariance of noise and chatter.
+        log: called as `log(step, metrics)` after each derivative or ensemble; step 0 is the nominal motion. Metrics are `rms`,
+            `share`, `seconds`, `most`, `motions`, `ensemble`, `start` and `starts`. The share of the motions was simulated. The
+            present part of the search takes these seconds more, about; the whole takes `most` at most. An rms is of one
+            motion, or of the mean of many over the covariance of noise and chatter; their ensembles are numbered from 1.
             Where more than noise is left, 512 other starts are compared, and the descents from the best are numbered from 1.
         progress: whether a search of more than two seconds tells on stderr how far it is, without a log.
 
@@ -120,17 +122,22 @@ def identify(
             shapes do not fit the scene.
         DivergedError: if the simulation diverges with the nominal values.
     """
+    whole("max_steps", max_steps)
     given = _checked(scene, parameters, recordings, delay, free_start, contact)
     instance("held_out", held_out, Sequence, "a list of recordings")
     for part in held_out:
         instance("recordings", part, Recording, "of mg.identification.Recording")
+    judged = None
+    if held_out:  # what does not fit the scene is refused before the search
+        windows = stack(given.motions.scene, held_out)
+        judged = after_start(windows, noise := spread(scene, held_out, free_start)), noise
     function("log", log, "step", "metrics")
     instance("progress", progress, bool, "True or False")
     has_noise = all(one.knows_noise and set(one.noise) == set(one.measured) for one in recordings)
     if log is None and progress:
         say = paced("identify")
         log = lambda step, metrics: say(as_text(step, metrics, has_noise))  # noqa: E731
-    search = _Search(given, whole("max_steps", max_steps), log)
+    search = _Search(given, max_steps, log)
     try:
         stopped = search.run(has_noise)
     except KeyboardInterrupt:
@@ -138,17 +145,17 @@ def identify(
     if stopped in (Stopped.INTERRUPTED, Stopped.STEPS):
         with contextlib.suppress(KeyboardInterrupt):
             search.keep_best()
-    return _identified(search, stopped, held_out, has_noise)
+    return _identified(search, stopped, judged, has_noise)
 
 
 def as_text(step: int, metrics: dict[str, float], has_noise: bool) -> str:
     """Return what the log of `identify` is given as a sentence."""
     part = "" if metrics["share"] == 1 else f" over the first {100 * metrics['share']:.0f} %"
-    num, index, count = (int(metrics[name]) for name in ("motions", "start", "starts"))
+    num, ensemble, index, count = (int(metrics[name]) for name in ("motions", "ensemble", "start", "starts"))
     doing = f", other start {index} of {count}" if index else f", best of {count} other starts" if count > 1 else ""
-    doing += f", mean of {num} motions" if num > 1 else ""
+    doing += f", ensemble {ensemble} of at most {MOST}, mean of {num} motions" if ensemble else ""
     error = f"error {metrics['rms']:.3g} times the {'noise' if has_noise else 'motion'}"
-    return f"step {step}: {error}{part}{doing}, about {duration(max(metrics['seconds'], 1))} to go"
+    return f"step {step}: {error}{part}{doing}, {durations((metrics['seconds'], metrics['most']))} to go"
 
 
 def outlook(
@@ -177,7 +184,7 @@ def outlook(
     # Half a standard error is the next width.
     half = _NARROW / max(float(np.linalg.norm(residual)), 1e-300)
     linear = search.linear(start.point, residual, widths, problem.num_steps, half)
-    num, more = search.price(is_rugged := search.is_rugged(linear, start.point, 1.0))
+    seconds, more = search.price(is_rugged := search.is_rugged(linear, start.point, 1.0))
     coordinates, factors = problem.motions.coordinates, None
     if is_rugged:  # jumps tell single secants apart, and much better than motions tell numbers
         with contextlib.suppress(DivergedError):
@@ -188,8 +195,7 @@ def outlook(
         factors = search.told(start.point, residual, linear)
     slope = _slope(problem, factors, coordinates.nominal)
     found = statistics(coordinates, coordinates.nominal, float(problem.num_numbers), slope, problem.num_numbers, 0)
-    seconds = num * search.pace, more * search.pace
-    return Outlook(coordinates, found, *seconds, int(num), len(problem.sizes), problem.num_steps, is_rugged, is_mean)
+    return Outlook(coordinates, found, seconds, more, len(problem.sizes), problem.num_steps, is_rugged, is_mean)
 
 
 def _checked(
@@ -217,12 +223,13 @@ class _Problem:
 
     def __init__(self, motions: Motions, recordings: Sequence[Recording], free_start: bool | None):
         self.motions, self.free_start = motions, free_start
+        self.windows = stack(motions.scene, recordings)
         self.spread = spread(motions.scene, recordings, free_start)
         # One unknown for each noisy number of a start, in units of its noise, or for all of them.
         sizes = np.ones_like(self.spread) if free_start else self.spread
         self.free = np.flatnonzero(sizes.any(axis=0))
         self.sizes = sizes[:, self.free]
-        self.windows = stack(motions.scene, recordings)
+        self.num_offsets = int(np.count_nonzero(self.sizes))  # a start that is exact has none
         for one in recordings:
             for text in doubts(motions.scene, one, free_start):
                 warnings.warn(f"{motions.scene.name}: in {one.name}, {text}", SceneWarning, stacklevel=2)
@@ -254,7 +261,10 @@ class _Search:
         self._rounding = float(np.finfo(problem.motions.scene.data.qpos.dtype).eps) ** 0.75
         self._to_go = 0.0  # of the last descent, standard errors squared
         self._early: list[Point] = []  # visited over a part of the recordings
-        self._ahead, self._later = 0.0, 0.0  # motions that this part of the search takes, about, and those after it
+        # Motions that this part of the search takes, about; those that it can take beyond that; those that can follow.
+        self._ahead, self._beyond, self._later = 0.0, 0.0, 0.0
+        self._others = 0.0  # motions that other starts can take, while they may be needed
+        self._noise: float | None = None
         self._start, self._starts = 0, 1  # which of how many other starts
         start = Point(np.zeros(problem.count), np.zeros(problem.sizes.shape))
         problem.residuals([start], problem.num_steps)  # compiles
@@ -297,28 +307,37 @@ class _Search:
         shares = _HORIZONS if self.problem.motions.compiles else np.geomspace(_HORIZONS[0], 1.0, _ROUNDS)
         return sorted({max(round(share * self.problem.num_steps), 1) for share in shares})
 
-    def price(self, is_rugged: bool) -> tuple[float, float]:
-        """Return the motions of all windows that a search takes, about, and those of other starts."""
+    def price(self, is_rugged: bool) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the seconds that a search takes, and those of other starts, each about and at most."""
+        descent, comparison, pace = self._descent(), self._comparison(), self.pace
+        expected, most = (EXPECTED * self._ensemble, LARGEST * self._ensemble) if is_rugged else (0.0, self._ensembles)
+        more = pace * (comparison + descent), pace * (comparison + _BEST * descent + most)
+        return (pace * (descent + expected), pace * (descent + most)), more
+
+    @functools.cached_property
+    def _ensemble(self) -> float:
+        """The price of an ensemble of the first size and of its algebra, in motions of all windows."""
         problem, columns = self.problem, (self.problem.count, self.problem.sizes.shape[1])
-        descent, many = _DESCENT * self._derivative(problem.num_steps), 0.0
-        if is_rugged:
-            numbers = problem.num_numbers // len(problem.sizes)
-            many = self._work(ensemble_size(sum(columns)), problem.num_steps)
-            many = EXPECTED * (many + len(problem.sizes) * algebra(*columns, numbers) / self.pace)
-        return descent + many, self._comparison() + descent
+        numbers = problem.num_numbers // len(problem.sizes)
+        motions = self._work(ensemble_size(sum(columns)), problem.num_steps)
+        return motions + len(problem.sizes) * algebra(*columns, numbers) / self.pace
+
+    @property
+    def _ensembles(self) -> float:
+        """The price of ensembles at most, in motions of all windows; 0 where nothing can touch, since little chatters then."""
+        return LARGEST * self._ensemble if self.problem.motions.scene.pairs else 0.0
+
+    def _descent(self) -> float:
+        return _DESCENT * self._derivative(self.problem.num_steps)
 
     def _comparison(self) -> float:
         return sum(self._work(_SCATTERED, steps) for steps in self._horizons())
 
-    def _after(self, noise: float | None) -> float:
-        """Return the motions of other starts if they are to be tried, by what is left now."""
-        return self.price(False)[1] if not self._start and self._is_off(noise) else 0.0
-
     def run(self, has_noise: bool) -> Stopped:
         """Return why the search ended."""
-        noise, whole = 1.0 if has_noise else None, self._derivative(self.problem.num_steps)
-        self._ahead = _DESCENT * whole
-        self._later = self.price(bool(self.problem.motions.scene.pairs))[0] - self._ahead
+        self._noise = noise = 1.0 if has_noise else None
+        self._ahead, self._later = self._descent(), self._ensembles
+        self._others = self._comparison() + _BEST * self._descent() + self._later
         self._say(self.first)
         stopped, is_rugged = self._descend(self.end.point, noise)
         if stopped is Stopped.STEPS:
@@ -329,7 +348,10 @@ class _Search:
             return self.end.stopped
         ends, is_rugged = [self._single], False
         for point in self._scattered(noise):
-            stopped, is_other_rugged = self._descend(point, noise)
+            try:
+                stopped, is_other_rugged = self._descend(point, noise)
+            except DivergedError:  # the ends before it stay
+                continue
             if stopped is Stopped.STEPS:
                 return stopped
             if any(self._is_alike(self._single, one) for one in ends):
@@ -358,11 +380,15 @@ class _Search:
         """Return the seconds since the search began."""
         return time.monotonic() - self._begun
 
-    def _say(self, rms: float, share: float = 1.0, motions: int = 1, starts: int | None = None) -> None:
+    def _say(
+        self, rms: float, share: float = 1.0, motions: int = 1, ensemble: int = 0, starts: int | None = None
+    ) -> None:
         if self._log is not None:
-            left = self.pace * (max(self._ahead, self._derivative(self.problem.num_steps)) + self._later)
-            told = {"motions": motions, "start": self._start, "starts": starts or self._starts}
-            self._log(self.num_steps, {"rms": rms, "share": share, "seconds": left, **told})
+            ahead = max(self._ahead, self._derivative(self.problem.num_steps))
+            most = ahead + self._beyond + self._later + self._others * self._is_off(self._noise)
+            told = {"rms": rms, "share": share, "seconds": self.pace * ahead, "most": self.pace * most}
+            told |= {"motions": motions, "ensemble": ensemble, "start": self._start, "starts": starts or self._starts}
+            self._log(self.num_steps, told)
 
     def keep_best(self) -> None:
         """Keep the point whose whole motion is best of all that were visited, with the derivative there."""
@@ -382,7 +408,7 @@ class _Search:
         """Minimise the residuals from a point over horizons that grow; return why it ended and whether the end is rugged."""
         problem = self.problem
         self._single = self.end._replace(squares=np.inf)
-        self._ahead = _DESCENT * self._derivative(problem.num_steps)
+        self._ahead = self._descent()
         widths: tuple[np.ndarray, np.ndarray] | None = None
         needed = 2 * (problem.count + problem.sizes.shape[1])
         horizons = [max(round(share * problem.num_steps), 1) for share in _HORIZONS]
@@ -396,7 +422,6 @@ class _Search:
             return stopped, False
         if self.is_rugged(linear, point, self.noise(noise)):
             return stopped, True
-        self._later = self._after(noise)  # no ensembles
         stopped, point, linear, _ = self._minimise(point, widths, horizons[-1], is_last=True)
         # Beside a jump no step is better, though derivatives foretell one.
         is_beside = self._to_go > 1.0 and not self._is_exact(math.sqrt(self.end.squares))
@@ -556,7 +581,7 @@ class _Search:
         if self.end.many is not None:
             return after > MISFIT * self.noise(noise)
         if noise:
-            freedom = self.problem.num_numbers - self.problem.count - self.problem.sizes.size
+            freedom = self.problem.num_numbers - self.problem.count - self.problem.num_offsets
             return exceeds_noise(after / noise, freedom)
         return after > _LEFT * self.first
 
@@ -568,8 +593,8 @@ class _Search:
         low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
         values = rng.uniform(low, high, (_SCATTERED, problem.count))
         starts = np.zeros((_SCATTERED, *problem.sizes.shape)) + self.end.point.starts
-        self._ahead = self._comparison()
-        self._later = _DESCENT * self._derivative(problem.num_steps)
+        self._ahead, self._beyond, self._others = self._comparison(), 0.0, 0.0
+        self._later = _BEST * self._descent() + self._ensembles
         for i, steps in enumerate(horizons, start=1):
             found = self.residuals([Point(*pair) for pair in zip(values, starts, strict=True)], steps)
             self._ahead -= self._work(_SCATTERED, steps)
@@ -584,8 +609,9 @@ class _Search:
                 for one in order[:_BEST]:
                     is_apart = all(np.abs(values[one] - values[other]).max() > _ALIKE[1] for other in chosen)
                     chosen += [one] if np.isfinite(losses[one]) and is_apart else []
-                self._starts, self._later = len(chosen), 0.0
+                self._starts = len(chosen)
                 for self._start, one in enumerate(chosen, start=1):
+                    self._later = (len(chosen) - self._start) * self._descent() + self._ensembles
                     yield Point(values[one], starts[one])
                 return
             beside = best[rng.integers(len(best), size=_SCATTERED - len(best))]
@@ -605,17 +631,19 @@ class _Search:
 
     def _average(self, alone: _End, noise: float) -> None:
         """Fit the mean of many motions, from the end of a descent, and keep it unless that explains nothing more."""
-        problem, before, began = self.problem, self.end, time.monotonic()
+        problem, before, began, index, spent = self.problem, self.end, time.monotonic(), 0, 0
+        self._later = 0.0
 
-        def say(best: Ensemble, squares: float, motions: int, ahead: float) -> None:
-            nonlocal began
-            pace, began = (time.monotonic() - began) / motions, time.monotonic()
-            self.num_steps, self._ahead = self.num_steps + 1, ahead * pace / self.pace
+        def say(best: Ensemble, squares: float, motions: int, ahead: tuple[float, float]) -> None:
+            nonlocal index, spent
+            index, spent = index + 1, spent + motions
+            pace = (time.monotonic() - began) / spent / self.pace  # with the algebra
+            self.num_steps += 1
+            self._ahead, self._beyond = ahead[0] * pace, (ahead[1] - ahead[0]) * pace
             if best.squares < before.squares:
                 stopped = Stopped.CONVERGED if best.is_settled else Stopped.STALLED
                 self.end = _End(Point(best.values, best.starts), best.factors, best.squares, None, None, best, stopped)
-            self._later = self._after(noise)
-            self._say(math.sqrt(squares / problem.num_numbers), motions=motions)
+            self._say(math.sqrt(squares / problem.num_numbers), motions=motions, ensemble=index)
 
         by_start, _, slope, _ = split(alone.factors, problem.count)
         excess = max(math.sqrt(alone.squares / problem.num_numbers), noise)
@@ -648,7 +676,9 @@ def _slope(problem: _Problem, factors: np.ndarray, values: np.ndarray) -> np.nda
     return split(factors, problem.count)[2] / problem.motions.coordinates.rates(values)
 
 
-def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording], has_noise: bool) -> Identification:
+def _identified(
+    search: _Search, stopped: Stopped, held_out: tuple[Windows, np.ndarray] | None, has_noise: bool
+) -> Identification:
     """Return the values at the end of a search with all that the recordings tell of them."""
     problem, end = search.problem, search.end
     coordinates, numbers = problem.motions.coordinates, problem.num_numbers
@@ -657,7 +687,7 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
     if end.linear is not None and end.residual is not None and stopped is not Stopped.INTERRUPTED:
         factors = search.told(end.point, end.residual, end.linear)
     slope = _slope(problem, factors, values)
-    verdict = statistics(coordinates, values, end.squares, slope, numbers, problem.sizes.size)
+    verdict = statistics(coordinates, values, end.squares, slope, numbers, problem.num_offsets)
     verdict["half_width"] = coordinates.unravel(verdict["half_width"])
     signals = np.zeros((1, 2, 1)) if end.residual is None else end.residual.reshape(*problem.windows.index.shape, -1)
     motions = problem.motions
@@ -669,7 +699,7 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
         at_bounds=tuple(np.array(coordinates.names)[coordinates.is_at_bound(values)].tolist()),
         rms=(search.first, math.sqrt(end.squares / numbers)),
         has_noise=has_noise,
-        held_out_rms=None if stopped is Stopped.INTERRUPTED or not held_out else _held_out(search, held_out),
+        held_out_rms=None if stopped is Stopped.INTERRUPTED or not held_out else _held_out(search, *held_out),
         offsets=problem.offsets(end.point.starts) if problem.free.size else None,
         correlation=float((signals[:, 1:] * signals[:, :-1]).sum() / ((signals**2).sum() or 1.0)),
         num_motions=1 if end.many is None else len(end.many.drawn),
@@ -684,11 +714,9 @@ def _identified(search: _Search, stopped: Stopped, held_out: Sequence[Recording]
     )
 
 
-def _held_out(search: _Search, held_out: Sequence[Recording]) -> tuple[float, float]:
-    """Return the rms residuals of held-out recordings at the nominal values and in the end."""
+def _held_out(search: _Search, judged: Windows, noise: np.ndarray) -> tuple[float, float]:
+    """Return the rms residuals of held-out windows at the nominal values and in the end; the noise is that of their starts."""
     problem, motions, end = search.problem, search.problem.motions, search.end
-    noise = spread(motions.scene, held_out, problem.free_start)
-    judged = after_start(stack(motions.scene, held_out), noise)
     starts, count = np.zeros(noise.shape), math.sqrt(num_numbers(judged))
     begins, known = (np.hstack([np.asarray(w.state.qpos), np.asarray(w.state.qvel)]) for w in (judged, problem.windows))
     # The end of a recording has the start that was found for its beginning.

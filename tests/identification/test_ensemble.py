@@ -8,7 +8,7 @@ import pytest
 
 import mjxgrad as mg
 from mjxgrad.identification import Recording
-from mjxgrad.identification.ensemble import Regression, fit
+from mjxgrad.identification.ensemble import LARGEST, Regression, fit
 from mjxgrad.identification.normal import split
 from mjxgrad.identification.recording import after_start, spread, stack
 
@@ -107,7 +107,26 @@ def test_the_best_of_ensembles_that_do_not_settle_is_returned():
     assert not found.is_settled
     assert found.squares == min(squares for _, squares, _ in told) == told[1][1] < told[-1][1]
     assert all(best.squares == min(squares for _, squares, _ in told[: i + 1]) for i, (best, *_) in enumerate(told))
-    assert min(ahead for *_, ahead in told[:-1]) > 0
+    assert min(ahead for *_, (ahead, _) in told[:-1]) > 0
+
+
+def test_the_motions_to_come_are_bounded_by_a_number_that_falls():
+    """Motions that are ever farther away never settle, and ensembles grow to four times their size: the dearest search."""
+    linear, *_ = _problem(1.0, 0.0, np.random.default_rng(0))
+    apart, spent, told = np.random.default_rng(1).normal(size=(_WINDOWS, _NUMBERS)), [], []
+
+    def motions(values, starts):
+        spent.append(len(values))
+        return linear(values, starts) + 20.0 * len(spent) * apart
+
+    given = (np.zeros(2), np.zeros((_WINDOWS, 3))), (np.ones(2), np.ones((_WINDOWS, 3))), (-np.ones(2), np.ones(2))
+    fit(motions, *given, 1.0, 120, lambda best, squares, num, ahead: told.append((sum(spent), *ahead)))
+    assert max(spent) == 4 * spent[0]
+    at, about, most = np.array(told).T
+    assert (np.diff(most) < 0).all()
+    assert (about <= most).all()
+    assert (at[:-1] + most[:-1] >= sum(spent)).all()
+    assert sum(spent) <= LARGEST * spent[0]
 
 
 def test_the_start_is_as_noisy_as_the_first_row_that_gives_it():

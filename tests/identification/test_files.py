@@ -1,5 +1,6 @@
 """Recordings, parameters and scenes as files; and the command that takes and writes them."""
 
+import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -15,9 +16,10 @@ from mjxgrad.identification.parameters import Parameter, write_all
 from mjxgrad.identification.recording import Recording, stack, start_of
 
 _SCENE = """<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
-  <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/></body>
-  <body name="cart" pos="2 0 1"><joint name="x" type="slide" axis="1 0 0" damping=".1"/><geom name="cart" size=".1" mass="2"/>
-  </body></worldbody><actuator><motor name="x" joint="x" gear="3"/><position name="servo" joint="x" kp="5" kv="1"/></actuator>
+  <body name="ball" pos="0 0 3"><freejoint name="root"/><geom name="ball" pos="1e-3 0 0" size=".1" mass="1"/></body>
+  <body name="cart" pos="2 0 1"><joint name="x" type="slide" axis="1 0 0" damping=".1" frictionloss=".1"/>
+  <geom name="cart" size=".1" mass="2"/></body></worldbody>
+  <actuator><motor name="x" joint="x" gear="3"/><position name="servo" joint="x" kp="5" kv="1"/></actuator>
   <sensor><jointpos name="place" joint="x"/><framepos name="tip" objtype="body" objname="cart"/></sensor></mujoco>"""
 _CART = """<mujoco><option timestep="0.01"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0" damping=".1"/>
   <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="motor" joint="x" gear="3"/></actuator></mujoco>"""
@@ -72,12 +74,23 @@ def test_columns_go_to_joints_sensors_and_actuators_by_name(scene, tmp_path):
         ({"time": [0, 1, 1], "place": [1, 2, 3]}, "time in .* must increase, got 1, then 1"),
         ({"time": [], "place": []}, "must have at least two rows of numbers, got 0"),
         ({"time": [0, 1], "x": [1, 2]}, "must say what it is, as one of ctrl:x, qpos:x"),
-        ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo"),
+        ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0]}, "it lacks servo$"),
         ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, 0], "servos": [0, 0]}, "is it servos"),
         ({"time": [0, 1], "ctrl:x": [0, 0], "servo": [0, 0], "palce": [1, 2]}, "did you mean place"),
-        ({"time": [0, "soon"], "x": [1, 2]}, "a line of names, then numbers.*line 3: could not"),
+        ({"time": [0, "soon"], "x": [1, 2]}, "a line of names, then numbers.*: time in line 3 is no number: 'soon'"),
+        (
+            {"time": [0, 1], "place": [1, 2], "ctrl:x": [0, "on"], "servo": [0, 0]},
+            "ctrl:x in line 3 is no number: 'on'",
+        ),
         ({"time": [0, 1], "qpos:palce": [1, 2]}, "qpos:palce, which is not of this scene; did you mean qpos:"),
-        ({"time": [0, 1], "place": [1, 2], "ctrl:x": [0, np.nan], "servo": [0, 0]}, "it lacks x from 1 s"),
+        (
+            {"time": [0, 1], "place": [1, 2], "ctrl:x": [0, np.nan], "servo": [0, 0]},
+            "x has no finite number in row 2, at 1 s$",
+        ),
+        (
+            {"time": [3, 4], "place": [1, 2], "servo": ["", ""]},
+            "it lacks x; its column servo has no .* in row 1, at 3 s$",
+        ),
         (bytes(range(256)), "a.csv must be a line of names, then numbers"),
         (b"time,x\n\n0,1,2", "line 3 has 3 cells, not 2"),
         (b"# made by a robot\ntime,x\n0,1", "line 1 is a comment, not names"),
@@ -92,6 +105,37 @@ def test_a_file_that_cannot_be_read_is_refused_with_what_it_lacks(scene, tmp_pat
     path.rename(tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"a\.npz must be an NPZ with arrays of numbers"):
         files.recording(scene, tmp_path / "a.npz")
+
+
+def test_actuators_with_several_controls_take_a_column_for_each(tmp_path):
+    """A pid has two, then comes a motor: controls are numbered through. Column names lead back to the same places."""
+    scene = mg.load_scene(
+        """<mujoco><worldbody><body><joint name="h"/><geom pos=".3 0 0" size=".1"/></body></worldbody>
+        <actuator><pid name="turn" joint="h" kp="5" kv=".3"/><motor name="push" joint="h"/></actuator></mujoco>""",
+        engine="mujoco",
+    )
+    columns = {"time": [0.0, 0.002], "qpos": [0.1, 0.2], "push": [5, 6], "turn[1]": [3, 4]}
+    _write(tmp_path / "a.csv", **columns, **{"turn[0]": [1, 2]})
+    found, unknown = files.recording(scene, tmp_path / "a.csv")
+    assert unknown == ()
+    np.testing.assert_array_equal(found.controls, [[1, 3, 5], [2, 4, 6]])
+    names = files.column_names(scene)
+    assert [names["ctrl", i] for i in range(3)] == ["ctrl:turn[0]", "ctrl:turn[1]", "ctrl:push"]
+    _write(tmp_path / "a.csv", **columns)
+    with pytest.raises(ValueError, match=r"it lacks turn\[0\]"):
+        files.recording(scene, tmp_path / "a.csv")
+
+
+def test_a_misspelt_column_is_told_with_the_name_that_it_is_like(scene, tmp_path):
+    """A second name of what is there already, or one that is like none, is no slip."""
+    columns = {"time": [0, 1], "qpos:x": [1, 2], "ctrl:x": [0, 0], "servo": [0, 0]}
+    _write(tmp_path / "a.csv", **columns, plac=[1, 2], servo2=[0, 0], camera=[0, 0])
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        _, unknown = files.recording(scene, tmp_path / "a.csv")
+    assert unknown == ("plac", "servo2", "camera")
+    (text,) = (str(one.message) for one in told)
+    assert text.endswith("a.csv has a column plac, which is not of this scene and is left out; did you mean place?")
 
 
 def test_an_archive_with_complex_numbers_is_refused(scene, tmp_path):

@@ -1,5 +1,6 @@
 """Parameters come back from motions that were made with them, as surely as the noise allows."""
 
+import contextlib
 import dataclasses
 import warnings
 
@@ -7,12 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import mjxgrad as mg
 from mjxgrad import identification
-from mjxgrad.identification import Parameter, Recording, Stopped
+from mjxgrad._text import duration
+from mjxgrad.identification import Parameter, Recording, Stopped, search
 from mjxgrad.identification.motions import Motions
 from mjxgrad.identification.recording import stack
+from mjxgrad.identification.search import as_text
 
 _STEP, _STEPS = 0.01, 40
 _CART = """<mujoco><option timestep="0.01"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>
@@ -102,8 +106,10 @@ def test_a_search_says_what_it_does_until_it_ends_and_no_further_start_follows_o
     gear = {"gear": identification.gear(cart, "motor")}
     mg.identify(cart, gear, [_noisy()], log=lambda step, metrics: told.append(metrics))
     assert all(one["seconds"] > 0 for one in told)
+    assert all(one["most"] >= one["seconds"] for one in told)
     assert {(one["start"], one["starts"]) for one in told} == {(0, 1), (0, 512), (1, 1)}
-    assert identification.outlook(cart, gear, [_noisy()]).more > 0
+    least, most = identification.outlook(cart, gear, [_noisy()]).more
+    assert 0 < least < most
 
 
 def test_what_a_recording_is_perhaps_not_is_told():
@@ -405,7 +411,8 @@ def test_what_recordings_cannot_tell_is_said_before_a_search(cart):
     alone = identification.outlook(cart, {"gear": gear}, [recording])
     error = 1e-3 / np.linalg.norm(_course(gear=1.0))
     np.testing.assert_allclose(np.sqrt(alone.told["covariance"][0, 0]), error, rtol=0.02)
-    assert alone.num_motions > 0 < alone.seconds < 5
+    assert 0 < alone.seconds[0] == alone.seconds[1] < 5  # nothing can touch, so there are no ensembles
+    assert alone.summary().startswith(f"About {duration(max(alone.seconds[0], 1))} for 1 recording of 40 steps; ")
 
 
 @pytest.mark.usefixtures("few_starts")
@@ -431,12 +438,17 @@ def test_damping_and_the_servo_s_are_one_force_and_told_as_their_sum(floor, nois
     parameters = {"damping": identification.damping(scene, "x"), "servo": identification.gains(scene, "servo")}
     before = identification.outlook(scene, parameters, [recording])
     assert before.is_rugged == floor
+    assert (before.seconds[1] > 2 * before.seconds[0]) == floor  # ensembles grow to four times their size
     (combination,) = before.told["inseparable"]
     assert combination == {"damping": 0.01, "servo[1]": pytest.approx(-0.01 * 8 / 20, rel=0.1)}
     assert "not told: damping with servo[1]" in before.summary()
     assert "+1 % of damping with -0.4 % of servo[1] changes nothing" in before.summary()
     assert np.isfinite(before.told["half_width"]).tolist() == [False, True, False]
-    result = mg.identify(scene, parameters, [recording])
+    told = []
+    result = mg.identify(scene, parameters, [recording], log=lambda *one: told.append(one))
+    ensembles = [as_text(*one, has_noise=True) for one in told if one[1]["motions"] > 1]
+    assert all(f", ensemble {i} of at most 16, mean of " in text for i, text in enumerate(ensembles[:3], 1))
+    assert (len(ensembles) > 2) == floor
     (combination,) = result.inseparable
     assert set(combination) == {"damping", "servo[1]"}
     assert "Cannot be told apart: damping, servo[1]" in result.summary()
@@ -444,6 +456,115 @@ def test_damping_and_the_servo_s_are_one_force_and_told_as_their_sum(floor, nois
     stiffness, damping = result.values["servo"]
     assert abs(stiffness - 320) < result.half_width["servo"][0] < 2e4 * noise
     np.testing.assert_allclose(result.values["damping"] + damping, 32.0, rtol=0.03)
+
+
+@pytest.mark.usefixtures("few_starts")
+def test_another_start_that_diverges_does_not_lose_what_was_found(cart, monkeypatch):
+    """The first descent ends at 3.3, where ten times the stated noise is left; the next one diverges."""
+    descents, descend = [], search._Search._descend
+
+    def diverges_later(*given):
+        descents.append(given)
+        if len(descents) > 1:
+            raise mg.DivergedError
+        return descend(*given)
+
+    monkeypatch.setattr(search._Search, "_descend", diverges_later)
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, [_noisy()])
+    assert len(descents) > 1
+    assert result.stopped is Stopped.CONVERGED
+    np.testing.assert_allclose(result.values["gear"], 3.3, atol=0.1)
+
+
+def test_exact_starts_are_no_unknowns(monkeypatch):
+    """Of ten starts nine are exact, so that two numbers of a start are unknown beside the gear.
+
+    The interval is Student's with as many degrees of freedom, and chi-square has as many.
+    """
+    cart = mg.load_scene(_CART, engine="mujoco")
+    rng, steps, freedoms, judge = np.random.default_rng(0), 4, [], search.exceeds_noise
+    monkeypatch.setattr(search, "exceeds_noise", lambda rms, freedom: freedoms.append(freedom) or judge(rms, freedom))
+    places, start = _course(drive=_DRIVE[:steps]), mg.initial_state(cart)
+    speeds, recordings = np.append(0.0, np.diff(places) / _STEP), []
+    for i in range(10):
+        measured = {"qpos": places + 1e-3 * rng.normal(size=5), "qvel": speeds + 1e-3 * rng.normal(size=5)}
+        noise = dict.fromkeys(measured, 1e-3)
+        recordings.append(Recording(measured, _DRIVE[:steps, None], noise=noise, start=start if i else None))
+    result = mg.identify(cart, {"gear": identification.gear(cart, "motor")}, recordings)
+    freedom = 10 * 2 * 5 - 1 - 2
+    factor = result.half_width["gear"] / np.sqrt(result.covariance[0, 0])
+    np.testing.assert_allclose(factor, scipy.stats.t.ppf(0.975, freedom), rtol=1e-5)
+    assert set(freedoms) == {freedom}
+
+
+def test_a_window_begins_with_the_control_of_its_own_time():
+    """Controls at 10 Hz equal their time, and so do those of windows of 0.25 s, which begin between two rows."""
+    at, times = np.arange(21) / 10, np.arange(201) / 100
+    recording = Recording({"qpos": 0 * times}, at[:, None], times=times, control_times=at)
+    windows = recording.cut(0.25, 0.01)
+    assert len(windows) == 8
+    for i, window in enumerate(windows):
+        found = np.interp(window.times, window.control_times, window.controls[:, 0])
+        np.testing.assert_allclose(found, 0.25 * i + window.times, atol=1e-12)
+
+
+def test_a_gap_longer_than_a_window_has_none():
+    """Half a second at 0 and at 3 s, so that the window from 2.75 s has one row, and those before it none."""
+    times = np.append(np.arange(50), np.arange(300, 351)) / 100
+    windows = Recording({"qpos": 0 * times}, times=times).cut(0.25, 0.01)
+    assert [window.name.removeprefix("the recording from ") for window in windows] == ["0 s", "0.25 s", "3 s", "3.25 s"]
+    with pytest.raises(ValueError, match=r"duration must be that of two rows of the recording at least, got 0\.25 s"):
+        Recording({"qpos": [0.0, 1.0, 2.0]}, times=[0, 1, 2]).cut(0.25, 0.01)
+
+
+def test_controls_reach_over_the_whole_motion_but_for_one_interval(cart):
+    """Five rows 0.1 s apart: 0.4 s, held for 0.1 s more at either end; a single row counts as a time step."""
+    for first, count, end, said in (
+        (0.0, 5, 0.5, None),
+        (0.1, 5, 0.5, None),
+        (0.0, 1, 0.01, None),
+        (0.0, 5, 0.51, "must reach from 0 to 0.51 s but for one interval, 0.1 s, got 0 to 0.4 s"),
+        (0.11, 5, 0.5, "must reach from 0 to 0.5 s but for one interval, 0.1 s, got 0.11 to 0.51 s"),
+        (0.0, 1, 0.02, "must reach from 0 to 0.02 s but for one interval, 0.01 s, got 0 to 0 s"),
+    ):
+        at = first + 0.1 * np.arange(count)
+        one = Recording({"qpos": np.zeros(2)}, np.ones((count, 1)), times=[0.0, end], control_times=at)
+        for use in (lambda one: stack(cart, [one]), lambda one, end=end: one.cut(end, _STEP)):
+            with contextlib.nullcontext() if said is None else pytest.raises(ValueError, match=said):
+                use(one)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "qvel of the recording must have 1 columns in this scene, got 3"),
+        ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_the_search(cart, given, said):
+    """A speed of three numbers as what is fitted, and as what is held out; and no steps at all, before anything else."""
+    wrong, gear = Recording({"qvel": np.zeros((41, 3))}, _DRIVE[:, None]), {"gear": identification.gear(cart, "motor")}
+    steps = []
+    for recordings, held_out in (([wrong], []), ([_noisy()], [wrong])):
+        with pytest.raises(ValueError, match=said):
+            mg.identify(cart, gear, recordings, held_out=held_out, log=lambda step, _: steps.append(step), **given)
+    assert steps == []
+
+
+def test_what_is_shown_at_a_prompt_is_short_and_says_what_it_is(cart):
+    """A recording by its signals, a parameter by its numbers, a result as `print` does."""
+    recording = Recording({"place": np.zeros(41)}, _DRIVE[:, None], name="walk")
+    assert repr(recording) == "Recording('walk': place (41, 1), controls (40, 1), one row per time step)"
+    alone = Recording({"qpos": np.zeros((3, 2))}, times=[0, 0.1, 0.25])
+    assert repr(alone) == "Recording('the recording': qpos (3, 2), no controls, 0.25 s)"
+    gear = identification.gear(cart, "motor")
+    assert repr(gear) == "Parameter(nominal=3, lower=0.3, upper=30, unit='')"
+    gains = Parameter([60.0, 3.0], [6.0, 0.3], np.inf, lambda model, value: {}, "N")
+    assert repr(gains) == "Parameter(nominal=[60 3], lower=[6 0.3], upper=[inf inf], unit='N')"
+    result = mg.identify(cart, {"gear": gear}, [dataclasses.replace(recording, measured={"place": _course()})])
+    assert repr(result) == result.summary()
+    before = identification.outlook(cart, {"gear": gear}, [recording])
+    assert repr(before) == before.summary()
 
 
 @pytest.mark.parametrize(
@@ -458,3 +579,18 @@ def test_recordings_without_rows_or_with_infinity_are_told_so(measured, said):
     with pytest.raises(ValueError, match="of the recording must") as refused:
         Recording(measured)
     assert said in str(refused.value)
+
+
+def test_recordings_with_and_without_a_start_go_together_in_a_scene_of_any_engine(cart):
+    """States of two engines carry more or less beside positions and velocities."""
+    scene = cart.with_engine("mjx")
+    one = _noisy()
+    given = dataclasses.replace(one, start=mg.initial_state(scene), name="with a start")
+    found = stack(cart, [one, given])
+    assert len(found.state.qpos) == 2
+
+
+def test_the_inertia_of_a_body_that_was_compiled_as_diagonal_is_no_parameter():
+    scene = mg.load_scene('<mujoco><worldbody><body name="b"><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+    with pytest.raises(ValueError, match="inertia of b, which was compiled as diagonal, cannot change"):
+        identification.inertia(scene, "b")
