@@ -94,19 +94,20 @@ def _content(value: Any, seen: dict[int, tuple[int, Any]]) -> Any:
             cells = [cell.cell_contents for cell in value.__closure__ or ()]
         except ValueError:
             raise _UnknownError from None
-        return value.__code__, *of(value.__defaults__, value.__kwdefaults__, cells, outside)
+        return value.__code__, *of(value.__defaults__, value.__kwdefaults__, vars(value), cells, outside)
     if isinstance(value, types.MethodType):
         return of(value.__func__, value.__self__)
     if isinstance(value, functools.partial):
         return type(value), *of(value.func, value.args, value.keywords)
     if isinstance(value, tuple | list):
         return type(value), *of(*value)
+    if isinstance(value, set | frozenset):
+        return type(value), frozenset(of(*value))
     if isinstance(value, dict | types.MappingProxyType):
         return type(value), *of(*value, *value.values())
     if isinstance(value, type):  # the user's, with the functions of its methods and properties
-        members = [
-            x for k, x in vars(value).items() if not k.startswith(("__", "_abc")) or k in ("__call__", "__init__")
-        ]
+        is_own = lambda k, x: not k.startswith(("__", "_abc")) or isinstance(x, types.FunctionType)  # noqa: E731
+        members = [x for k, x in vars(value).items() if is_own(k, x)]
         inner = [getattr(x, "method", getattr(x, "fget", getattr(x, "__func__", x))) for x in members]
         return itself, *of(value.__bases__, inner)
     if hasattr(value, "__wrapped__"):  # a compiled function

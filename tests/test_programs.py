@@ -73,3 +73,26 @@ def test_functions_of_equal_content_share_a_program():
             for name, value in change.items():
                 patch.setitem(globals(), name, value)
             assert parted(function)[1] is not before
+
+
+def test_what_a_function_carries_and_refers_to_belongs_to_its_content():
+    """Its own attributes, a set, and an operator of a class."""
+
+    class Factor:
+        def __mul__(self, x):
+            return x
+
+    factor, chosen = Factor(), {"one"}
+    by_set, by_operator = (lambda x: x * ("two" in chosen)), (lambda x: factor * x)
+
+    def by_attribute(x):
+        return x * by_attribute.gain  # pyright: ignore[reportFunctionMemberAccess]
+
+    by_attribute.gain = 1.0
+    before = [parted(one, trusts_hash=True)[1] for one in (by_set, by_operator, by_attribute)]
+    assert before == [parted(one, trusts_hash=True)[1] for one in (by_set, by_operator, by_attribute)]
+    chosen.add("two")
+    by_attribute.gain = 2.0
+    Factor.__mul__ = lambda self, x: 2 * x
+    after = [parted(one, trusts_hash=True)[1] for one in (by_set, by_operator, by_attribute)]
+    assert not set(before) & set(after)
