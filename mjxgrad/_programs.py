@@ -112,7 +112,8 @@ def _content(value: Any, seen: dict[int, tuple[int, Any]]) -> Any:
         return itself, *of(value.__bases__, inner)
     if hasattr(value, "__wrapped__"):  # a compiled function
         return itself, *(() if _is_installed(value) else of(value.__wrapped__))
-    if state := getattr(value, "__dict__", None):
+    state = getattr(value, "__dict__", None)
+    if state or (state is not None and not _is_installed(type(value))):
         return of(type(value), state)
     if isinstance(value, np.ufunc) or isinstance(getattr(value, "__self__", None), types.ModuleType):
         return itself
