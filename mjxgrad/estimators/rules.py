@@ -159,18 +159,18 @@ class LeastRisk(eqx.Module):
 
     Two sources tell $b^2$, and the smaller counts:
 
-    - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it. What noise alone exceeds with the probability $2\sqrt{V/V^0}$ is
-      taken off, $V$ being $V^1$ as a rule: a bias that is not there would cost $V^0$, and one that is there, unseen, as much as
-      is taken off. By this balance the largest ratio to the better part's error, over all biases, is near the least that any
-      rule of both means can have. This is near 1 where noise is worth 16 coordinates or more, but in a single one it is 1.9
-      where $V^1$ is a tenth of $V^0$, 3.4 where it is a hundredth: there nobody can promise more.
+    - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it. What noise alone exceeds with the probability $2 v^{1/2}$, or
+      $4.5 v^{2/3}$ where that is less, is taken off, $v$ being $V^1/V^0$ as a rule: a bias that is not there would cost $V^0$, one
+      that is there, unseen, as much as is taken off. By this balance the largest ratio to the better part's error, over all
+      biases, is near the least that any rule of both means can have. This is near 1 where noise is worth 16 coordinates or more,
+      but in a single one it is 1.9 where $v$ is a tenth, 3.4 at a hundredth, 7.4 at $10^{-4}$: there nobody can promise more.
     - $U$, by what derivatives leave unexplained in the costs, bounds it from above (see `SecantSums`). It is zero for a
       quadratic. Where samples are fewer than dimensions, it lies below $V^0$: no bias does more harm there than the noise of
       zeroth order.
 
     Derivatives that scatter about the right mean leave much unexplained, but no more than they scatter; derivatives that miss
-    jumps do. With $J$ the part of $U$ that scatter does not explain, $pJ/n$ is the part of $V^0$ that is due to jumps. $V$ is at
-    least that, and so jumps show at once; and at least $V^0/100$, for no derivative is trusted without limit.
+    jumps do. With $J$ the part of $U$ that scatter does not explain, $pJ/n$ is the part of $V^0$ that is due to jumps. $v V^0$ is
+    at least that, and so jumps show at once; and $v$ at least $10^{-4}$, for no derivative is trusted without limit.
 
     In a descent (see `Memory`) $D$ is that of the mean over its last steps, and $b^2$ counts as many times as there are steps
     over which noise averages.
@@ -200,13 +200,16 @@ def _taken_off(evidence: Evidence) -> Float[Array, "*batch"]:
     jumps = evidence.noise_dim * evidence.squared_jump_bound / jnp.maximum(evidence.count, 1)
     first = jnp.maximum(jnp.maximum(evidence.first_noise, jumps), _LEAST_NOISE * zeroth)
     # Noise worth p coordinates exceeds so many errors with the probability exp(-rate) at most.
-    rate = jnp.maximum(jnp.log(zeroth / (4 * jnp.where(first > 0, first, 1))) / 2, 0)
+    ratio = jnp.log(zeroth / jnp.where(first > 0, first, 1))
+    rate = jnp.maximum(jnp.maximum((ratio - jnp.log(4.0)) / 2, 2 / 3 * ratio - 1.5), 0)
     far = jnp.sqrt(2.0) * (jnp.sqrt(rate) + rate / jnp.sqrt(evidence.noise_dim))
     # At least one in many coordinates, where it costs nothing: else noise counts as bias half of the time.
     return jnp.maximum(1 - 1 / evidence.noise_dim, far)
 
 
-_LEAST_NOISE = 0.01  # of that of zeroth order
+_LEAST_NOISE = (
+    1e-4  # of that of zeroth order; with 1e-2 first order's errors would grow a hundredfold where it is far ahead
+)
 # Above this, a single coordinate is not the worst case among Gaussian quadratic forms.
 _MOST_FAILURES = 0.2
 _LONGEST_TABLE = 1000

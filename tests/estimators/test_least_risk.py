@@ -17,7 +17,10 @@ ROUNDS = 600  # of a game between a prior and its best estimate
 BIASES, LENGTHS = 100, 500
 
 
-@pytest.mark.parametrize(("dim", "noise"), [(1, 0.3), (1, 0.1), (1, 0.01), (2, 0.03), (4, 0.01), (16, 0.1), (64, 0.01)])
+CASES = [(1, 0.3), (1, 0.1), (1, 0.01), (1, 1e-3), (1, 1e-4), (2, 0.03), (4, 0.01), (4, 1e-4), (16, 0.1), (64, 1e-4)]
+
+
+@pytest.mark.parametrize(("dim", "noise"), CASES)
 def test_no_rule_of_both_means_has_a_worst_case_much_better(dim, noise):
     scale = np.sqrt(1 + noise)  # of the difference, in which biases and lengths are
     most = 3 * np.sqrt(dim) + 6

@@ -36,6 +36,7 @@ def evidence(**changes) -> Evidence:
     return Evidence(**{name: jnp.broadcast_to(jnp.asarray(value), shape) for name, value in facts.items()})
 
 
+RARE = 2 / 3 * np.log(1e4) - 1.5  # of the least noise that first order is taken to have
 RADIUS = 2.0095752 * np.sqrt(4 / 50)
 
 
@@ -88,7 +89,7 @@ def assert_decides(rule, facts: Evidence, alpha: float, reason, bias_bound: floa
             for noise, jumps, dim, errors in [
                 (8e-4, 0.0, 4.0, np.sqrt(2 * np.log(5)) + np.log(5) / np.sqrt(2)),
                 (0.0, 0.01, 4.0, np.sqrt(2 * np.log(5)) + np.log(5) / np.sqrt(2)),
-                (0.0, 0.0, 1.0, np.sqrt(2 * np.log(5)) + np.log(5) * np.sqrt(2)),
+                (0.0, 0.0, 1.0, np.sqrt(2 * RARE) + RARE * np.sqrt(2)),
                 (0.0, 1.0, 1.0, 0.0),
             ]
         ],
