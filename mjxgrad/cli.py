@@ -131,6 +131,7 @@ def check(
     *,
     cost: str | None = None,
     start: str | None = None,
+    horizon: Whole | None = None,
     html: Path | None = None,
     quick: Switch = False,
     mjx: Switch = False,
@@ -143,6 +144,8 @@ def check(
         scene: an MJCF file.
         cost: file.py:function or module:function, from a trajectory to its cost; or height:body and others, see `sweep`.
         start: a key frame by name, about whose controls all motions are; by default all key frames and the reference pose.
+        horizon: number of time steps over which derivatives are measured, such as your task's; by default 40 to 300, by first
+            touches and the budget.
         html: write a page to this file.
         quick: only fast checks, in seconds: contact, time step, parts without effect, one value and derivative of the cost.
         mjx: compare a step by MJX with C MuJoCo's, too, which takes up to a minute to compile.
@@ -154,9 +157,11 @@ def check(
     if not budget > 0:
         raise CommandError(f"--budget must be positive, got {budget:g}; --quick measures no derivatives")
     log = _timed()
-    log(f"takes up to {10 if quick else budget + 8:.0f} s{', and a minute to compile' * mjx}; Ctrl-C ends it sooner")
+    more = ", or what eight motions of so many steps take" * (horizon is not None and not quick)
+    more += ", and a minute to compile" * mjx
+    log(f"takes up to {10 if quick else budget + 8:.0f} s{more}; Ctrl-C ends it sooner")
     mg = _library()
-    given = {"start": start, "budget": budget, "seed": seed, "log": log}
+    given = {"start": start, "horizon": horizon, "budget": budget, "seed": seed, "log": log}
     verdict = mg.check(scene, cost, derivatives=not quick, mjx=mjx, **given)
     _print(finished(verdict.summary), sys.stdout)
     if html is not None:
@@ -305,13 +310,21 @@ def identify(
 
 
 @app.command
-def new(scene: str, *, output: Path = Path("task.py"), start: str | None = None, force: Switch = False) -> None:
+def new(
+    scene: str,
+    *,
+    output: Path = Path("task.py"),
+    start: str | None = None,
+    horizon: Whole | None = None,
+    force: Switch = False,
+) -> None:
     """Write a program that optimises a motion of a scene and films it, with the settings that a check recommends.
 
     Args:
         scene: an MJCF file, with actuators.
         output: the program to write.
         start: a key frame by name, from which its motion begins; by default the first, else the reference pose.
+        horizon: number of time steps of its motion; by default half a second, but 50 to 300 steps.
         force: overwrite an existing program.
     """
     if output.suffix != ".py":  # of the same name with .mp4 is its film
@@ -325,9 +338,9 @@ def new(scene: str, *, output: Path = Path("task.py"), start: str | None = None,
     if not mg.load_scene(scene, engine=quick).mj_model.nu:
         raise CommandError(f"{scene} has no actuators; the README's first example varies the start of such a scene")
     log("checks the scene for up to 20 s; Ctrl-C ends that sooner")
-    verdict = mg.check(scene, start=start, log=log)
+    verdict = mg.check(scene, start=start, horizon=horizon, log=log)
     program = importlib.import_module("mjxgrad.checking.check").program
-    text, seconds = program(verdict, str(Path(scene)), str(output.with_suffix(".mp4")))
+    text, seconds = program(verdict, str(Path(scene)), output)
     write(output, text)
     told = f"write your cost into it, then {shlex.join(['python', str(output)])}, which takes about {duration(10 + seconds)}"
     _print(f"{verdict.headline}\nwrote {output}: {told}", sys.stdout)

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -53,6 +54,14 @@ def test_check_prints_its_verdict_and_says_no_fault_by_its_exit_code(scene, caps
     assert "First to touch" in said.err
 
 
+def test_a_check_measures_over_the_steps_asked_for(scene, capsys):
+    """Three are no motion, and a tenth of a second costs none of them."""
+    assert cli.main(["check", scene, "--horizon", "3"]) == 2
+    assert "horizon must be at least 4, got 3" in capsys.readouterr().err
+    assert cli.main(["check", scene, "--horizon", "90", "--budget", "0.1"]) in (0, 1)
+    assert "derivatives over 90 steps, 0.18 s" in capsys.readouterr().err
+
+
 def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
     Path(scene).write_text(SCENE.format(gear=0))
     assert cli.main(["check", scene, "--quick", "--html", "page.html"]) == 1
@@ -71,7 +80,7 @@ def test_a_fault_is_said_by_the_exit_code_and_the_page(scene, capsys):
         (["check", "scene.xml", "--quick", "--cost", "nowhere:cost"], "cost must be file.py:function, module:function"),
         (
             ["check", "scene.xml", "--quick", "--cost", "costs.py:wrong"],
-            "'costs.py:wrong' raised AttributeError: 'Trajectory' object has no attribute 'pos'\n",
+            "'costs.py:wrong' raised AttributeError: 'Trajectory' object has no attribute 'pos' (costs.py, line 8)\n",
         ),
         (
             ["check", "scene.xml", "--quick", "--cost", "costs.py:stop"],
@@ -249,7 +258,7 @@ def test_a_signal_within_a_long_computation_ends_the_process_within_a_second_or_
         assert process.stdout is not None
         began, first = time.monotonic(), process.stderr.readline()
         assert "moving from the start under noise" in first
-        while " s a gradient, by C MuJoCo" not in (line := process.stderr.readline()):
+        while " s a gradient of 16 rollouts, by C MuJoCo" not in (line := process.stderr.readline()):
             assert line
         assert time.monotonic() - began < 30
         while "parts" not in (line := process.stderr.readline()):
@@ -310,6 +319,24 @@ def test_new_says_what_its_program_takes_and_what_its_video_lacks(scene, capsys,
     monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
     assert cli.main(["new", scene, "--force"]) == 0
     assert "pip install 'mjxgrad[render]'" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("checks_quickly")
+@pytest.mark.parametrize(("output", "is_absolute"), [("sub/task.py", False), ("task.py", False), ("sub/task.py", True)])
+def test_a_new_program_finds_its_scene_and_its_film_from_any_folder(scene, tmp_path, output, is_absolute):
+    Path("sub").mkdir()
+    assert (
+        cli.main(["new", str(tmp_path / scene) if is_absolute else scene, "--output", output, "--horizon", "70"]) == 0
+    )
+    program = Path(output).read_text()
+    (source,) = re.findall(r"load_scene\((.*), engine", program)
+    (film,) = re.findall(r"write_video\((.*), mg", program)
+    names = {"Path": Path, "__file__": str(tmp_path / output)}
+    found, filmed = (Path(eval(one, names)) for one in (source, film))
+    assert found.is_absolute()
+    assert found.samefile(scene)
+    assert filmed == (tmp_path / output).with_suffix(".mp4")
+    assert "horizon=70" in program
 
 
 @pytest.mark.parametrize("name", ["optax", "equinox", "numpy"])

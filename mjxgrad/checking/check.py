@@ -27,12 +27,13 @@ from mjxgrad.batched import device
 from mjxgrad.checking import findings
 from mjxgrad.checking.costs import Cost, named_cost
 from mjxgrad.checking.findings import Finding, Recommendation
-from mjxgrad.checking.measure import Line, Measured, Noise, measure, seconds_by_engine, slopes
+from mjxgrad.checking.measure import Line, Measured, Noise, checked_horizon, measure, seconds_by_engine, slopes
 from mjxgrad.checking.motions import (
     Motions,
     Mover,
     Outcomes,
     half_range,
+    heaviest,
     most_contacts,
     random_motions,
     seconds_of,
@@ -47,12 +48,12 @@ from mjxgrad.scene import Scene, SceneWarning, load_scene
 Source = str | os.PathLike[str] | mujoco.MjSpec | mujoco.MjModel | Scene
 _Function = TypeVar("_Function", bound=Callable)
 _BATCH = 64  # motions along a line, or under noise
-_MOST_TREES = 3
 _SPARE_CONTACTS, _MANY_CONTACTS = 4, 40
 _WIDTH = 100
 _SIZE = (4.6, 2.9)  # of a figure, in inches
 _UNITS = {"where": "m, rad", "how": "m/s, rad/s"}  # by an outcome's first word; others have the user's units
 _NUM_STEPS, _FEWEST, _MOST_SAMPLES = 30, 4, 16  # of a program's optimisation
+_UNNAMED = "scene.xml"  # in code for a scene that is of no file
 _PATIENCE = 90.0  # s that it may take with more than the fewest samples
 _MOVED = 0.6  # approximate share of the budget for simulating motions
 
@@ -63,7 +64,7 @@ class Verdict(Paged):
 
     Attributes:
         name: name of the scene.
-        headline: the answer, in at most 25 words.
+        headline: the answer, and what to mind most, in sentences of at most 25 words.
         findings: faults first, then errors and prices; at last what was left out for lack of time.
         recommendation: recommended settings.
         code: the recommended settings as code to paste.
@@ -75,6 +76,7 @@ class Verdict(Paged):
         seconds: duration in s of a time step of a "motion", and of its "discrete" gradient and its "slope", by C MuJoCo on
             all cores; none without actuators.
         start: the key frame that was asked for; None for all.
+        horizon: the number of time steps that was asked for; None for that of the recommendation.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Verdict(Paged):
     measured: Measured | None
     seconds: dict[str, float]
     start: str | int | None
+    horizon: int | None
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -143,6 +146,7 @@ def check(
     cost: str | Cost | None = None,
     *,
     start: str | int | None = None,
+    horizon: int | None = None,
     derivatives: bool = True,
     mjx: bool = False,
     budget: int | float = 12.0,
@@ -162,10 +166,13 @@ def check(
             motions are then simulated from their start. None uses random mixes of final positions and velocities.
         start: a key frame, by name or index, from which all motions begin, about its controls. None takes all key frames and
             the reference pose, and controls about the middle of their ranges.
+        horizon: number of time steps over which derivatives are measured, such as your task's: at least 4, and at most those of
+            the random motions, 2 s, but 50 to 1000. Slow scenes then get fewer motions. None takes 40 to 300 by first touches
+            and the budget.
         derivatives: whether to measure derivatives; False looks at motions alone, and calls a cost once.
         mjx: whether to compare a step by MJX with C MuJoCo's, too; it takes up to a minute to compile.
         budget: approximate duration in s, half of it for motions and derivatives. Slow scenes get fewer steps. The verdict names
-            measurements that are left out.
+            measurements that are left out; one line, by eight motions at least, is never.
         seed: seed of all random numbers.
         log: called with the name of each part as it starts.
         progress: whether a check of more than two seconds tells on stderr where it is, without a log.
@@ -174,8 +181,8 @@ def check(
         The verdict; `print` it.
 
     Raises:
-        ValueError: if `budget` is not positive, there is no such key frame, or the cost does not return a number or numbers to
-            be added up.
+        ValueError: if `budget` is not positive, `horizon` is out of range, there is no such key frame, or the cost does not
+            return a number or numbers to be added up.
         SceneError: if MuJoCo cannot read the source; also all errors of `load_scene`.
     """
     instance("derivatives", derivatives, bool, "True or False")
@@ -202,6 +209,7 @@ def check(
         except KeyboardInterrupt:
             say(f"interrupted before anything was measured of\n\n{scene.summary()}")
             raise
+    horizon = checked_horizon(horizon, motions)
     found = [*findings.static_findings(scene, motions, stability), *_warned(caught)]
     for finding in found:
         say(("! " if finding.is_fault else "- ") + finding.text)
@@ -222,7 +230,7 @@ def check(
             say("measuring derivatives by C MuJoCo")
             end = max(begun + budget, started + budget / 2) + time.perf_counter() - asked
             mover = Mover(scene, _BATCH, outcomes, end)
-            settings = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say}
+            settings = {"from_start": cost is not None, "seconds": _MOVED * budget, "log": say, "horizon": horizon}
             with contextlib.suppress(TimeoutError):
                 measured = measure(scene, motions, mover, rng, **settings)
         was_interrupted = measured is not None and measured.was_interrupted
@@ -231,13 +239,14 @@ def check(
             found.append(findings.engine_finding(scene, motions))
     except KeyboardInterrupt:
         was_interrupted = True
-    path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else "scene.xml"
+    path = str(source) if isinstance(source, str | os.PathLike) and scene.name != "the MJCF" else _UNNAMED
     if derivatives and is_any_sound:
         measured = measured if measured and measured.lines else None
         found += findings.measured_findings(measured) if measured else ()
+        found += findings.untouched_findings(scene, motions, measured) if measured and cost is None else ()
         found += findings.left_out_findings(measured, None if was_interrupted else budget)
     seen = scene, motions, stability, measured, prices
-    of = path, cost if isinstance(cost, str) else None, start
+    of = path, cost if isinstance(cost, str) else None, start, horizon
     return finished(lambda: _verdict(*seen, [*found], names, of, None if was_interrupted else say))
 
 
@@ -249,15 +258,18 @@ def _verdict(
     prices: dict[str, float],
     found: list[Finding],
     names: tuple[str, ...],
-    of: tuple[str, str | None, str | int | None],
+    of: tuple[str, str | None, str | int | None, int | None],
     say: Callable[[str], None] | None,
 ) -> Verdict:
-    """Return what all findings amount to, of a file, the name of a cost and a start; without `say` engines are not compared."""
+    """Return what all findings amount to, of a file, a cost's name, a start and a horizon; without `say` engines go untimed."""
+    path, cost, start, horizon = of
     # Fewer contact slots, if motions needed far fewer than all; other motions may have more contacts than these.
     room = 2 * most_contacts(scene, motions.qpos) + _SPARE_CONTACTS if scene.pairs else 0
     slots = room if scene.data._impl.ncon > max(2 * room, _MANY_CONTACTS) else None
     price = prices["slope"] / prices["discrete"] if prices else math.inf
     advice = findings.recommend(motions, stability, measured, slots, price)
+    if measured is None and horizon is not None:
+        advice = dataclasses.replace(advice, horizon=horizon)
     # It compiles for minutes, which a quick check, or one that was interrupted, does not wait for.
     is_asked = prices and measured and not device.is_cpu()
     if say and is_asked and (seconds := seconds_by_engine(scene, ENGINES, say)):
@@ -273,14 +285,15 @@ def _verdict(
         headline=findings.headline(found, advice, motions, told, totals),
         findings=tuple(sorted(found, key=lambda one: (not one.is_fault, order.get(one.kind, 2)))),
         recommendation=advice,
-        code=_code(scene, advice, *of),
+        code=_code(scene, advice, path, cost, start),
         outcomes=names,
         scene=scene,
         stability=stability,
         motions=motions,
         measured=measured,
         seconds=prices,
-        start=of[-1],
+        start=start,
+        horizon=horizon,
     )
 
 
@@ -305,16 +318,14 @@ def outcomes_of(scene: Scene, cost: Cost | None, rng: np.random.Generator) -> tu
     if cost is not None:
         return ("the cost",), lambda trajectory: checked_cost(cost(trajectory), len(trajectory.ctrl)).sum()[None]
     model = scene.mj_model
-    trees = np.unique(model.body_rootid[model.jnt_bodyid])
-    heaviest = sorted(trees.tolist(), key=lambda root: -model.body_subtreemass[root])[:_MOST_TREES]
-    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or f"body {root}" for root in heaviest]
+    roots = heaviest(model)
     dof_joints, sizes = model.dof_jntid, np.diff([*model.jnt_qposadr, model.nq])
     mixes = []
     for joints in (np.repeat(np.arange(model.njnt), sizes), dof_joints):
-        is_own = model.body_rootid[model.jnt_bodyid[joints]] == np.array(heaviest)[:, None]
+        is_own = model.body_rootid[model.jnt_bodyid[joints]] == np.array([*roots])[:, None]
         weights = rng.normal(size=is_own.shape) * is_own
         mixes.append(jnp.asarray(weights / np.sqrt((weights**2).sum(axis=1, keepdims=True))))
-    words = [f"where {name} ends up" for name in names] + [f"how fast {name} is in the end" for name in names]
+    words = [f"where {x} ends up" for x in roots.values()] + [f"how fast {x} is in the end" for x in roots.values()]
     ends = lambda trajectory: (trajectory.qpos[-1], trajectory.qvel[-1])  # noqa: E731
     return tuple(words), lambda t: jnp.concatenate([mix @ end for mix, end in zip(mixes, ends(t), strict=True)])
 
@@ -332,10 +343,11 @@ def _noise_text(noise: Noise) -> str:
 
 
 def _setup(
-    scene: Scene, advice: Recommendation, path: str, start: str | int | None, more: str = "", cost: str | None = None
+    scene: Scene, advice: Recommendation, file: str, start: str | int | None, more: str = "", cost: str | None = None
 ) -> str:
-    """Return the beginning of a program with the recommended settings, up to its start and its task."""
-    yours, drive = "  # your file" * (not Path(path).exists()), " + 1e-3 * (trajectory.ctrl**2).mean()"
+    """Return the beginning of a program with the recommended settings, up to its start and its task; its file is code."""
+    yours = "  # your file" * (file == repr(_UNNAMED) and not Path(_UNNAMED).exists())
+    drive = " + 1e-3 * (trajectory.ctrl**2).mean()"
     costing = f"""\
 # Your cost, from a trajectory to a number; here how far it comes (m or rad).
 cost = lambda trajectory: -trajectory.qpos[-1, 0]{drive * bool(scene.model.nu)}
@@ -353,7 +365,7 @@ import jax
 import jax.numpy as jnp
 import mjxgrad as mg
 {more}
-scene = mg.load_scene({path!r}{settings}){yours}
+scene = mg.load_scene({file}{settings}){yours}
 {costing}\
 start = mg.initial_state(scene{_keyframe(scene, start)})
 task = mg.SceneTask(scene, start, cost, horizon={advice.horizon}, {findings.chosen(advice.gradient)})
@@ -383,27 +395,30 @@ def _code(scene: Scene, advice: Recommendation, path: str, cost: str | None, sta
         run = f"task.run(None, start=mg.initial_state(scene, qvel=velocity{_keyframe(scene, start)})).cost"
         objective = f"mg.parameter_noise(lambda velocity: {run}, stddev={noise}, dim={scene.model.nv})"
     return f"""\
-{_setup(scene, advice, path, start, cost=cost)}\
+{_setup(scene, advice, repr(path), start, cost=cost)}\
 objective = {objective}
 params = {f"jnp.tile({_home(scene, start)}, task.horizon)" if scene.model.nu else "jnp.zeros(objective.dim)"}
 estimate = mg.estimators.{advice.estimator}(objective, params, jax.random.key(0), num_samples=32)
 """
 
 
-def program(verdict: Verdict, path: str, video: str) -> tuple[str, float]:
+def program(verdict: Verdict, path: str, output: Path) -> tuple[str, float]:
     """Return a program that optimises a motion of a scene with actuators by the recommended settings, and films it.
 
-    With it go the seconds that its optimisation will take, of which long motions get fewer samples.
+    It finds the scene from its own folder, the output's. With it go the seconds that its optimisation will take, of which long
+    motions get fewer samples.
     """
     advice = verdict.recommendation
     timestep = advice.timestep or verdict.motions.timestep
-    horizon, held = min(300, max(50, round(0.5 / timestep))), max(1, round(0.05 / timestep))
+    horizon = verdict.horizon or min(300, max(50, round(0.5 / timestep)))
+    held = max(1, round(0.05 / timestep))
     each = _NUM_STEPS * horizon * verdict.seconds.get(advice.gradient, 0.0)
     num_samples = int(np.clip(_PATIENCE / max(each, 1e-9), _FEWEST, _MOST_SAMPLES)) // 2 * 2
     more = "import optax\n\nmg.keep_compiled()  # on disk, so that the next run starts at once"
+    advice = dataclasses.replace(advice, horizon=horizon)
     parts = {
         "name": repr(Path(path).name)[1:-1].replace('"', "'"),  # within a docstring
-        "setup": _setup(verdict.scene, dataclasses.replace(advice, horizon=horizon), path, verdict.start, more),
+        "setup": _setup(verdict.scene, advice, _from(output.parent, path), verdict.start, more),
         "home": _home(verdict.scene, verdict.start),
         "held": held,
         "num_knots": -(-horizon // held),
@@ -411,10 +426,18 @@ def program(verdict: Verdict, path: str, video: str) -> tuple[str, float]:
         "estimator": advice.estimator,
         "num_samples": num_samples,
         "num_steps": _NUM_STEPS,
-        "video": repr(video),
     }
     template = string.Template(Path(__file__).with_name("program.txt").read_text("utf-8"))
     return template.substitute(parts), each * num_samples
+
+
+def _from(folder: Path, path: str) -> str:
+    """Return code for the path of a file, seen from the folder of the program; one that is absolute stays so."""
+    if Path(path).is_absolute():
+        return repr(path)
+    # The folders' real places, since `..` leads out of a link's target.
+    place = os.path.relpath(os.path.realpath(Path(path).parent), os.path.realpath(folder))
+    return f"Path(__file__).parent / {(Path(place) / Path(path).name).as_posix()!r}"
 
 
 def telling(measured: Measured, outcomes: Sequence[str]) -> Block:

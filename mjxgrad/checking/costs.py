@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import runpy
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -82,12 +83,17 @@ def _told(name: str) -> Iterator[None]:
             f"cost {name!r} ended the program; put what it runs under if __name__ == '__main__'"
         ) from error
     except Exception as error:
+        source = name.rpartition(":")[0]
+        file = getattr(sys.modules.get(source), "__file__", None) or source
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [one.lineno for one in frames if Path(one.filename).resolve() == Path(file).resolve()]
+        place = f" ({file}, line {lines[-1]})" if lines else ""
         if isinstance(error, jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError):
             wanted = "must compute with jax.numpy, got NumPy, float() or if on traced numbers"
-            raise ValueError(f"cost {name!r} {wanted}") from error
+            raise ValueError(f"cost {name!r} {wanted}{place}") from error
         forms = "; a cost must be file.py:function, module:function, or of a body as height:torso"
-        forms *= isinstance(error, ModuleNotFoundError) and error.name == name.rpartition(":")[0]
-        raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}{forms}") from error
+        forms *= isinstance(error, ModuleNotFoundError) and error.name == source
+        raise ValueError(f"cost {name!r} raised {type(error).__name__}: {error}{place}{forms}") from error
 
 
 def _body_or_site(model: mujoco.MjModel, name: str) -> tuple[int, bool]:

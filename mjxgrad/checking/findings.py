@@ -14,6 +14,7 @@ import numpy as np
 from mjxgrad._interrupts import patiently
 from mjxgrad._text import format_number, name_pairs
 from mjxgrad.checking.measure import (
+    AFTER,
     FEWEST_READINGS,
     NUM_COMPARED,
     STDDEVS,
@@ -24,7 +25,7 @@ from mjxgrad.checking.measure import (
     slopes,
     unmeasured,
 )
-from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, run, start_of
+from mjxgrad.checking.motions import REFINED, Direction, Motions, Mover, heaviest, run, start_of
 from mjxgrad.diagnostics.stability import Spring, StabilityReport
 from mjxgrad.engines import ENGINES, QUICK, Trajectory
 from mjxgrad.engines.state import LARGEST_GROWTH
@@ -116,7 +117,8 @@ def static_findings(scene: Scene, motions: Motions, stability: StabilityReport) 
 def _in_degrees(model: mujoco.MjModel) -> list[str]:
     """Return the position servos of limited hinges whose control range is many times that of the hinge."""
     found = []
-    for i in np.flatnonzero(model.actuator_ctrllimited & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)):
+    control, is_affine = model.actuator_ctrladr, model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    for i in np.flatnonzero(model.actuator_ctrllimited[control] & is_affine):
         joint, is_of_joint = model.actuator_trnid[i, 0], model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         is_servo = 0 < model.actuator_gainprm[i, 0] == -model.actuator_biasprm[i, 1]
         if (
@@ -126,7 +128,7 @@ def _in_degrees(model: mujoco.MjModel) -> list[str]:
             and model.jnt_limited[joint]
         ):
             reach = np.abs(model.actuator_gear[i, 0] * model.jnt_range[joint]).max()
-            if np.abs(model.actuator_ctrlrange[i]).max() > _DEGREES * reach:
+            if np.abs(model.actuator_ctrlrange[control[i]]).max() > _DEGREES * reach:
                 found.append(model.actuator(i).name or f"actuator {i}")
     return found
 
@@ -158,19 +160,47 @@ def _contact_findings(scene: Scene, motions: Motions) -> Iterator[Finding]:
         yield Finding("note", f"In contact from the start, and nothing else touches: {name_pairs(motions.touching)}.")
 
 
+def untouched_findings(scene: Scene, motions: Motions, measured: Measured) -> Iterator[Finding]:
+    """Yield those of the heaviest bodies that were not touched within the measured time: their outcomes tell of no contact."""
+    model = scene.mj_model
+    trees = model.body_rootid[model.geom_bodyid]
+    could = {int(tree) for pair in scene.pairs for tree in trees[[pair.geom1, pair.geom2]]}
+    num_steps = round(measured.times[-1] / motions.timestep)
+    for root, name in heaviest(model).items():
+        first = motions.reached[:, trees == root].min(axis=1, initial=np.inf)
+        soonest = min((first[motion] - begin for motion, begin in measured.windows), default=np.inf)
+        if num_steps < soonest < np.inf:
+            needed = min(int(soonest) + AFTER, motions.controls.shape[1])
+            text = (
+                f"{name} is not touched within the {measured.times[-1]:.2g} s that were measured, but after "
+                f"{soonest * motions.timestep:.2g} s: give --horizon {needed}, in Python horizon={needed}."
+            )
+            yield Finding("untouched", text, True)
+        elif root in could and np.isinf(first).all() and (motions.touches or motions.touching):
+            seconds = motions.controls.shape[1] * motions.timestep
+            yield Finding("note", f"{name} can be touched, but no random motion does so within {seconds:.3g} s.")
+
+
 def cost_finding(motions: Motions, mover: Mover) -> Finding:
-    """Call the cost once with its derivative, along a random motion that stays finite; useless ones are a fault."""
+    """Call the cost with its derivative along a random motion that stays finite; useless ones are a fault by kind."""
     rng, motion = np.random.default_rng(0), int(np.argmax(motions.bad_steps < 0))
     controls = motions.controls[motion, None, :100]  # a cost of long motions may take long
-    start = jax.tree.map(lambda leaf: np.asarray(leaf)[None], motions.state(motion, 0))
+    start = jax.tree.map(lambda leaf: np.array(leaf)[None], motions.state(motion, 0))
     change = Direction(*[rng.normal(size=x.shape[1:]) for x in (start.qvel, start.qvel, controls)])
     found = mover.move("slope", start, controls, change, [controls.shape[1]])
-    value, derivative = found.outcomes.item(), found.derivatives.item()
-    is_useless = derivative == 0 or not math.isfinite(value + derivative)
     when = f"after {controls.shape[1] * motions.timestep:.2g} s of a random motion"
-    remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero." * is_useless
+    value, derivative = found.outcomes.item(), found.derivatives.item()
+    kind, remedy = "cost", ""
+    if not math.isfinite(value):
+        kind, remedy = "cost_not_finite", " Look for divisions, roots and logarithms in it."
+    elif derivative == 0 or not math.isfinite(derivative):
+        remedy = " Norms and roots at zero have no derivative; counts and comparisons have zero."
+        start.qvel[:] += change.velocities
+        found = mover.move("plain", start, controls + change.controls, change, [controls.shape[1]])
+        if found.outcomes.item() == value:
+            kind, remedy = "cost_unfelt", " It is the same of another motion: it must depend on the trajectory."
     text = f"The cost is {value:.3g} {when}, its derivative along a change {derivative:.2g}.{remedy}"
-    return Finding("cost", text, is_useless)
+    return Finding(kind, text, bool(remedy))
 
 
 def index_findings(scene: Scene, motions: Motions, cost: Callable[[Trajectory], Any]) -> Iterator[Finding]:
@@ -250,7 +280,7 @@ def left_out_findings(measured: Measured | None, budget: int | float | None) -> 
 
 
 def slope_finding(found: Sequence[Slope]) -> Finding:
-    """Return how far each derivative is from the slope, and which is nearer how often; a fault where both are far."""
+    """Return how far each derivative is from the slope, and which is nearer how often; a fault where both are known to be far."""
     slope, discrete = found
     if not (count := slope.errors.size):
         return Finding("slope", "Which derivative is the slope cannot be told: no slope was clear enough to compare.")
@@ -261,14 +291,14 @@ def slope_finding(found: Sequence[Slope]) -> Finding:
     nearer, alike = (slope.errors < discrete.errors).sum(), (slope.errors == discrete.errors).sum()
     text = f"{lead}: {both}. The slope is nearer in {nearer}" + f" and as near in {alike}" * bool(alike)
     text += ", which is too few to choose by: a larger budget measures more" * (count < FEWEST_READINGS)
-    return Finding("slope", f"{text}.", is_fault=far)
+    return Finding("slope", f"{text}.", is_fault=far and count >= FEWEST_READINGS)
 
 
 def price_finding(prices: Mapping[str, float], found: Sequence[Slope], horizon: int) -> Finding:
     """Return what a gradient costs, and whether the slope is worth its price."""
     slope, discrete = (prices[kind] for kind in ("slope", "discrete"))
     text = (
-        f"The gradient of a motion of {horizon} steps takes {slope:.2g} s by {chosen('slope')} and {discrete:.2g} s by "
+        f"A gradient of one rollout of {horizon} steps takes {slope:.2g} s by {chosen('slope')} and {discrete:.2g} s by "
         f"{chosen('discrete')}, by C MuJoCo in a batch on all cores"
     )
     if found and found[0].errors.size and slope > discrete and nearest(found, slope / discrete) == "discrete":
@@ -283,7 +313,9 @@ def engine_prices_finding(seconds: Mapping[EngineName, tuple[float, float]]) -> 
     told = [
         f"{seconds[one][1]:.2g} s by {ENGINES[one].title} (the first time {seconds[one][0]:.2g} s)" for one in ordered
     ]
-    text = f"{NUM_COMPARED} discrete gradients of {STEPS_COMPARED} steps side by side take {', '.join(told)}"
+    text = (
+        f"Discrete gradients of {NUM_COMPARED} rollouts of {STEPS_COMPARED} steps side by side take {', '.join(told)}"
+    )
     return Finding("engine_prices", f"{text}.")
 
 
@@ -350,13 +382,14 @@ def recommend(
     limits = [noise.crossover for noise in own]
     limits += [t for line in measured.lines for t in measured.times[line.growth > LARGEST_GROWTH].tolist()]
     limit = min(limits, default=math.inf)
-    is_limited = limit < measured.times[-1]
+    last = float(measured.times[-1])
+    is_limited = limit < last
     is_helped = is_limited and any(soft.advantage > 4 * max(one.advantage, 1) for soft in softer for one in own)
     return Recommendation(
         gradient=best,
         estimator="alpha_order" if has_jumps or is_limited or not own or _is_far(found) else "first_order",
         stddev=stddev,
-        horizon=max(10, round(min(limit, measured.times[-1]) / motions.timestep)),
+        horizon=round(max(min(10 * motions.timestep, last), min(limit, last)) / motions.timestep),
         timestep=timestep,
         stiffness=softer[0].stiffness if is_helped else None,
         max_contacts=max_contacts,
@@ -394,24 +427,28 @@ def headline(
     found: Sequence[Slope],
     prices: Mapping[str, float],
 ) -> str:
-    """Return the answer in at most 25 words: what to take, how sure, what it costs, and the worst fault."""
+    """Return the answer, what to take, how sure and what it costs, and in a second sentence the worst fault."""
     sure = "an unmeasured choice"
     for one in found:
-        if one.kind == advice.gradient and one.errors.size:
-            sure = f"{percent(one.error)} off by {one.errors.size} reading{'s' * (one.errors.size > 1)}"
+        if one.kind == advice.gradient:
+            is_told = (count := one.errors.size) >= FEWEST_READINGS
+            sure = f"{percent(one.error)} off by {count} readings" if is_told else "too few readings to tell"
     if not (motions.touches or motions.touching):
         sure = "without contact, exact"
-    cost = f"; {prices[advice.gradient]:.2g} s a gradient" if prices else ""
+    cost = f"; {prices[advice.gradient]:.2g} s a gradient of one rollout" if prices else ""
     ahead = f"{advice.horizon * motions.timestep:.2g} s ahead"
-    minded = [finding.kind for finding in findings if finding.is_fault]
+    minded = {finding.kind: finding.text for finding in reversed(findings) if finding.is_fault}  # of one kind the first
     words = {
         "time_step": "the time step is too long",
         "not_finite": "motions leave all numbers",
         "index": "the cost looks beyond an array",
+        "cost_not_finite": "the cost is not finite",
+        "cost_unfelt": "the cost does not feel the motion",
         "cost": "the cost has no derivative",
         "engines": "MJX moves it otherwise",
         "start": "it begins in a bad pose",
         "no_contact": "nothing touches",
+        "untouched": minded.get("untouched", "").partition(" within")[0],
         "no_effect": "an actuator has no effect",
         "jump": "the outcome jumps",
         "explodes": "the derivative explodes",

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.random import Generator
 
+from mjxgrad._arrays import whole
 from mjxgrad._interrupts import patiently
 from mjxgrad._text import format_number
 from mjxgrad.checking.motions import (
@@ -44,9 +45,10 @@ STDDEVS = (0.1, 0.3)
 SOFTER = 0.1
 """Softer stiffness to compare with the file's, as a share of it."""
 _NUM_LINES, _NUM_TIMES = 3, 4
-_BEFORE, _AFTER = 30, 40  # steps around the first touch
+_BEFORE, AFTER = 30, 40
+"""Steps around the first touch."""
 _FEWEST_STEPS, _MOST_STEPS, _TRIED_STEPS = 40, 300, 8
-_FEWER = 8  # times fewer motions than a batch, at most, have their slopes taken, which take most of the time
+_FEWEST_MOTIONS = 8  # of a batch whose derivatives are taken, which take most of the time
 _SHARE = 0.6  # of the time that is left, for the slopes of a line or of noise
 _SMALLEST_JUMP = 0.05  # share of the outcome's variation along the line
 _CLEAR = 0.1  # largest relative error of a usable slope
@@ -193,6 +195,7 @@ class Measured:
     noises: tuple[Noise, ...]
     left_out: tuple[str, ...] = ()
     was_interrupted: bool = False
+    windows: tuple[tuple[int, int], ...] = ()  # of each line its motion, and the step of this with which it begins
 
 
 def measure(
@@ -204,13 +207,14 @@ def measure(
     from_start: bool,
     seconds: int | float,
     log: Callable[[str], None],
+    horizon: int | None = None,
 ) -> Measured:
-    """Measure along lines and under noise within a budget in seconds, and leave out the rest."""
+    """Measure along lines and under noise within a budget in seconds, and leave out the rest; without a horizon, choose it."""
     order = sorted(np.flatnonzero(motions.bad_steps < 0).tolist(), key=lambda i: motions.onsets[i] < 0)
     begins = [0 if from_start else max(0, int(motions.onsets[i]) - _BEFORE) for i in order]
     onsets = [int(motions.onsets[i]) - begin for i, begin in zip(order, begins, strict=True)]
     mover.is_needed = True
-    lengths = patiently(lambda: _lengths(mover, motions, order[0], begins[0], onsets, seconds))
+    lengths = patiently(lambda: _lengths(mover, motions, order[0], begins[0], onsets, seconds, horizon))
     num_steps = lengths[-1]
     # A motion with a late first touch starts shortly before it.
     begins = [min(begin, motions.controls.shape[1] - num_steps) for begin in begins]
@@ -219,10 +223,11 @@ def measure(
     chosen = [(order[i % len(order)], begins[i % len(order)]) for i in range(_NUM_LINES)]
     directions = [_direction(scene, rng, num_steps, motions.touch_speed or 1.0, i) for i in range(_NUM_LINES)]
     softer = [SOFTER * float(np.median(np.asarray(scene.contact_parameters().stiffness)))] if scene.pairs else []
-    lines, noises, left_out, end = [], [], [], mover.end
+    lines, windows, noises, left_out, end = [], [], [], [], mover.end
 
     def line(*task: Any) -> None:
         lines.append(probe.line(*task))
+        windows.append(task[:2])
 
     def noise(stddev: float, stiffness: float | None, own_rng: Generator) -> None:
         noises.append(probe.noise(*chosen[0], stddev, stiffness, own_rng, nearest(slopes(lines))))
@@ -249,16 +254,30 @@ def measure(
             log("interrupted: the verdict is of what was measured")
             left_out.append(words)
             end = 0.0
-    times = np.array(lengths) * motions.timestep
-    return Measured(times, tuple(lines), tuple(noises), tuple(left_out), was_interrupted=end == 0.0)
+    times, found = np.array(lengths) * motions.timestep, map(tuple, (lines, noises, left_out))
+    return Measured(times, *found, was_interrupted=end == 0.0, windows=tuple(windows))
+
+
+def checked_horizon(horizon: int | None, motions: Motions) -> int | None:
+    """Return a number of steps over which these motions can be measured; refuse others."""
+    most = motions.controls.shape[1]
+    if horizon is not None and whole("horizon", horizon, _NUM_TIMES) > most:
+        raise ValueError(f"horizon must be at most {most}, the time steps of the random motions, got {horizon}")
+    return horizon
 
 
 def _lengths(
-    mover: Mover, motions: Motions, motion: int, begin: int, onsets: list[int], seconds: int | float
+    mover: Mover,
+    motions: Motions,
+    motion: int,
+    begin: int,
+    onsets: list[int],
+    seconds: int | float,
+    horizon: int | None,
 ) -> list[int]:
-    """Choose the number of steps, by first touches and the time of steps about one, and the steps at which to look."""
-    wanted = max([onset for onset in onsets if onset >= 0], default=0) + _AFTER
-    still, size = np.zeros(motions.qvel.shape[2]), mover.size // _FEWER
+    """Return the steps at which to look; without a horizon, choose the last by first touches and the time of steps about one."""
+    wanted = max([onset for onset in onsets if onset >= 0], default=0) + AFTER
+    still, size = np.zeros(motions.qvel.shape[2]), _FEWEST_MOTIONS
     direction = Direction(still, still, np.zeros((_TRIED_STEPS, motions.controls.shape[2])))
     begin = max(0, min(begin + _BEFORE, motions.controls.shape[1]) - _TRIED_STEPS // 2)
     states = _repeated(motions.state(motion, begin), size)
@@ -266,7 +285,8 @@ def _lengths(
     for _ in range(2):
         mover.move("slope", states, controls, direction, [controls.shape[1]])
     affordable = seconds / max(4 * mover.seconds("slope", mover.size), 1e-9)
-    num_steps = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
+    usual = int(np.clip(min(wanted, affordable), _FEWEST_STEPS, min(_MOST_STEPS, motions.controls.shape[1])))
+    num_steps = horizon or usual
     return sorted({max(1, round(num_steps * i / _NUM_TIMES)) for i in range(1, _NUM_TIMES + 1)})
 
 
@@ -311,14 +331,14 @@ class _Probe:
             return self.mover.move(kind, states, varied, direction, self.lengths)
 
         places = phases((-1.0, 1.0), self.mover.size)
-        own, fine = along("discrete", places), along("fine", places)
-        slope = self._in_time(functools.partial(along, "slope"), places)
+        own, fine = along("plain", places), along("fine", places)
+        slope, discrete = self._in_time(along, KINDS, places)
         self.mover.is_needed = False
         spreads = np.nanstd(own.outcomes, axis=0)
         is_felt = spreads > _UNFELT * np.nanmax(spreads, initial=_UNFELT)
         own, fine = own.where(is_felt), fine.where(is_felt)
         # Both are seen at the same motions.
-        derivatives = [slope.derivatives, np.where(np.isnan(slope.derivatives), np.nan, own.derivatives)]
+        derivatives = [slope.derivatives, np.where(np.isnan(slope.derivatives), np.nan, discrete.derivatives)]
         plain, shorter = (compare_to_slope(places, one.outcomes, derivatives, KINDS) for one in (own, fine))
         centre = np.nanmean(fine.outcomes[:, -1], axis=0)
         # Outcomes at rest vary by rounding alone.
@@ -335,17 +355,18 @@ class _Probe:
         growth = np.nanmedian(slope.growth, axis=0) if moves_start else np.full(len(self.lengths), np.nan)
         return Line(pose, words, plain, shorter, jumps, changed, growth, own.num_diverged + fine.num_diverged)
 
-    def _in_time(self, move: Callable[..., Moved], values: np.ndarray) -> Moved:
-        """Move as many values of a batch, evenly spread, as there is time for, an eighth at least; the others are NaN."""
+    def _in_time(self, move: Callable[..., Moved], kinds: Sequence[Kind], values: np.ndarray) -> list[Moved]:
+        """Move as many values of a batch, evenly spread, as there is time for by each kind, at least 8; the others are NaN."""
         left = _SHARE * max(self.mover.end - time.perf_counter(), 1e-9)
-        stride = math.ceil(min(_FEWER, self.mover.seconds("slope", self.lengths[-1] * len(values)) / left)) or 1
+        needed, most = self.mover.seconds("slope", self.lengths[-1] * len(values)), len(values) // _FEWEST_MOTIONS
+        stride = math.ceil(min(most, needed / left)) or 1
 
         def spread(x: np.ndarray) -> np.ndarray:
             (found := np.full((len(values), *x.shape[1:]), np.nan))[::stride] = x
             return found
 
-        part = move(values[::stride])
-        return Moved(spread(part.outcomes), spread(part.derivatives), spread(part.growth), part.num_diverged)
+        parts = [move(kind, values[::stride]) for kind in kinds]
+        return [Moved(spread(x.outcomes), spread(x.derivatives), spread(x.growth), x.num_diverged) for x in parts]
 
     def _changed(self, state: State, controls: np.ndarray, direction: Direction, jumps: Jumps) -> tuple[str, ...]:
         """Return the pairs that touch only on one side of the jumps; a glancing hit jumps once per time step."""
@@ -382,7 +403,7 @@ class _Probe:
         found = under("discrete", noise)
         derivatives = found.derivatives
         if kind == "slope":
-            derivatives = self._in_time(functools.partial(under, kind), noise).derivatives
+            derivatives = self._in_time(under, [kind], noise)[0].derivatives
         # An outcome depends only on the noise of earlier steps.
         scores = np.cumsum((noise * along).sum(axis=2), axis=1) / stddev**2
         scores = scores[:, [min(length, len(along)) - 1 for length in self.lengths]]

@@ -5,6 +5,7 @@ Random motions come first because they take a second and locate the expensive me
 
 import dataclasses
 import functools
+import itertools
 import math
 import os
 import time
@@ -44,9 +45,10 @@ _SMALLEST_EFFECT = 1e-9  # m, rad: above the rounding in double precision over t
 _TIMED, _SOON = 40, 0.5  # steps of which the price is taken, and s after which it is taken twice alone
 _ROUNDING = 1e-6  # m, of gaps in single precision
 _CLEARANCE = 0.01  # m, beyond the margin: a nearer pair may touch in similar motions
-Kind = Literal["slope", "discrete", "fine"]
+_MOST_TREES = 3  # whose final states are outcomes
+Kind = Literal["slope", "discrete", "plain", "fine"]
 KINDS: tuple[Kind, ...] = ("slope", "discrete")
-"""Kind of derivative of MuJoCo's motion; "fine" is the motion at a `REFINED` times shorter time step, without derivatives."""
+"""Kinds of derivatives of MuJoCo's motion; it has none as "plain", nor as "fine", at a `REFINED` times shorter time step."""
 REFINED = 4
 CONTACT_FIELDS = ("geom_solref", "geom_solimp", "pair_solref", "pair_solimp")
 _States = dict[str, Any]  # qpos, qvel and act, with leading axes
@@ -74,6 +76,7 @@ class Motions:
     timestep: float  # time step of the scene, in s
     bad_steps: Int[np.ndarray, " motions"]  # first step that is not finite or too fast, −1 if there is none
     onsets: Int[np.ndarray, " motions"]  # step of the first new touch, −1 if there is none
+    reached: Float[np.ndarray, "motions geoms"]  # step at which a geom first touches another, infinite if it never does
     touches: tuple[Touch, ...]  # pairs that begin to touch, in order of time
     touching: tuple[str, ...]  # pairs in contact from the first step on
     idle: tuple[str, ...]  # actuators whose control has no effect
@@ -88,6 +91,13 @@ class Motions:
         """Return the state of a motion after a number of steps."""
         qpos, qvel, act = (jnp.asarray(x[motion, step], float) for x in (self.qpos, self.qvel, self.act))
         return State(qpos, qvel, act, time=jnp.asarray(step * self.timestep), warmstart=jnp.zeros_like(qvel))
+
+
+def heaviest(model: mujoco.MjModel) -> dict[int, str]:
+    """Return the heaviest bodies that move, each with all that hangs on it, and their names."""
+    trees = np.unique(model.body_rootid[model.jnt_bodyid])
+    roots = sorted(trees.tolist(), key=lambda root: -model.body_subtreemass[root])[:_MOST_TREES]
+    return {root: mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, root) or f"body {root}" for root in roots}
 
 
 def half_range(scene: Scene) -> Float[np.ndarray, " nu"]:
@@ -117,12 +127,13 @@ def random_motions(scene: Scene, rng: Generator, key: int | None = None) -> Moti
     start: _States = dict(zip(("qpos", "qvel", "act"), map(np.array, parts), strict=True))
     path, bad_steps = held(run(scene, start, controls))
     qpos, qvel, act = path.values()
-    touches, touching, onsets = _touches(model, qpos, qvel)
+    touches, touching, onsets, reached = _touches(model, qpos, qvel)
     begin = max(0, int(onsets[0]) - _REPLAYED)
     window = controls[0, begin : begin + 2 * _REPLAYED]
     idle = _idle(scene, {name: x[:1, begin] for name, x in path.items()}, window, half)
     exact = touching_exactly(scene, qpos[0, 0])
-    return Motions(names, qpos, qvel, act, controls, timestep, bad_steps, onsets, touches, touching, idle, exact)
+    course = qpos, qvel, act, controls, timestep
+    return Motions(names, *course, bad_steps, onsets, reached, touches, touching, idle, exact)
 
 
 def _starts(
@@ -213,15 +224,18 @@ def held(path: _States) -> tuple[_States, Int[np.ndarray, " motions"]]:
 
 def _touches(
     model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray
-) -> tuple[tuple[Touch, ...], tuple[str, ...], Int[np.ndarray, " motions"]]:
-    """Return the pairs that begin to touch in any motion, the initially touching ones, and each motion's first touch."""
+) -> tuple[tuple[Touch, ...], tuple[str, ...], Int[np.ndarray, " motions"], Float[np.ndarray, "motions geoms"]]:
+    """Return the pairs that begin to touch in any motion, the initially touching ones, each motion's first touch and geoms'."""
     data, found, always, onsets = mujoco.MjData(model), {}, {}, np.full(len(qpos), -1)
+    reached = np.full((len(qpos), model.ngeom), np.inf)
     before = set()
     for motion, step in np.ndindex(qpos.shape[:2]):
         data.qpos[:], data.qvel[:] = qpos[motion, step], qvel[motion, step]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         now = {tuple(map(int, contact.geom)): contact for contact in data.contact if contact.efc_address >= 0}
+        for geom in itertools.chain.from_iterable(now):
+            reached[motion, geom] = min(reached[motion, geom], step)
         # Bodies that rest on each other press from the first step on.
         if step <= 1:
             always, before = always | now, set(now)
@@ -231,7 +245,8 @@ def _touches(
             found[pair] = (min(time, step * model.opt.timestep), max(speed, _approach(model, data, now[pair])))
         before = set(now)
     named = [Touch(_pair(model, pair), *when) for pair, when in found.items()]
-    return tuple(sorted(named, key=lambda touch: touch.time)), tuple(_pair(model, pair) for pair in always), onsets
+    ordered = sorted(named, key=lambda touch: touch.time)
+    return tuple(ordered), tuple(_pair(model, pair) for pair in always), onsets, reached
 
 
 def most_contacts(scene: Scene, qpos: Float[np.ndarray, "motions states nq"]) -> int:
@@ -273,7 +288,7 @@ def pairs_at(scene: Scene, state: State, controls: Float[np.ndarray, "steps nu"]
     """Return the pairs that touch at any time of a motion by C MuJoCo, at a time step divided by `refined`."""
     start = {name: x[None] for name, x in start_of(state).items()}
     path, _ = held(run(scene, start, controls[None], refined=refined))
-    touches, touching, _ = _touches(scene.to_mujoco(), path["qpos"], path["qvel"])
+    touches, touching, *_ = _touches(scene.to_mujoco(), path["qpos"], path["qvel"])
     return frozenset([touch.pair for touch in touches]) | frozenset(touching)
 
 
@@ -351,7 +366,7 @@ class Mover:
         controls = np.asarray(controls, float)[:, :steps]
         pushes = np.broadcast_to(direction.controls[:steps], controls.shape)
         change = np.concatenate([direction.positions, direction.velocities, np.zeros(start["act"].shape[1])])
-        follow = None if kind == "fine" else (kind, (np.tile(change, (num, 1)), pushes))
+        follow = (kind, (np.tile(change, (num, 1)), pushes)) if kind in ("slope", "discrete") else None
         refined = REFINED if kind == "fine" else 1
         started = time.perf_counter()
         found = run(self.scene, start, controls, softness=softness, refined=refined, follow=follow)

@@ -41,7 +41,7 @@ from mjxgrad.stepping import Contact, Discrete, EngineName, Slope
 STIFFNESS = (1e2, 1e3, 1e4, 1e5, 1e6)
 _SECONDS, _MOST_STEPS, _FEWEST_STEPS = 0.5, 300, 50
 _SHORT = 0.33  # time step times the frequency of a contact, from which it lasts at most three steps
-_ERRORS = f"Error of a gradient from {BATCH} rollouts, by bias and scatter, over the gradient."
+_ERRORS = f"Error of a gradient of {BATCH} rollouts, by bias and scatter, over the gradient itself."
 _UNFELT = 1e-9  # of the cost, gradients that are rounding
 _PAIRS = 256  # pairs of rollouts at once
 _FEW = 8  # numbers of a direction that are printed
@@ -166,7 +166,7 @@ class Knob:
     def error(
         self, contact: Contact, softness: Softness, key: PRNGKeyArray, truth: tuple[np.ndarray, np.ndarray]
     ) -> float:
-        """Return the error to expect of a first-order gradient from 16 rollouts by C MuJoCo, beside a truth and its error."""
+        """Return the error to expect of a first-order gradient of 16 rollouts by C MuJoCo, beside a truth and its error."""
         objective = self._traced(softness)
         objective = dataclasses.replace(objective, task=objective.task.with_contact(contact))
         found = first_order(objective, jnp.zeros(1), key, num_samples=BATCH)
@@ -209,7 +209,7 @@ def nearer(
     """Return the knob with the derivative that errs less, and why, where that is not the slope."""
 
     def error(contact: Slope | Discrete) -> float:
-        say(f"{BATCH} gradients by {chosen(contact.gradient)}, to see which derivative errs less")
+        say(f"a gradient of {BATCH} rollouts by {chosen(contact.gradient)}, to see which derivative errs less")
         return knob.error(contact, softness, key, truth)
 
     slope, discrete = error(Slope()), error(Discrete())
@@ -234,7 +234,7 @@ class Sweep(Paged):
         return [format_number(k) + " (file)" * bool(k == self.own) for k in self.result.knob[1]]
 
     def errors(self) -> dict[str, Float[np.ndarray, " softness"]]:
-        """Return the error to expect of a gradient from 16 rollouts, over the gradient's size, by estimate.
+        """Return the error to expect of a gradient of 16 rollouts, over the gradient's size, by estimate.
 
         Its square is that of the bias, less what the bias's own error adds, and a sixteenth of the variance of one rollout.
         """
@@ -292,8 +292,8 @@ class Sweep(Paged):
             seen = seen if is_biased or reach <= 1 else "these rollouts are too few to see its bias"
             sure = f"its variance is {ratio:.2g} of zeroth order's and {seen}"
         others = ", ".join(f"{ESTIMATES[name]} {percent(x[row])}" for name, x in errors.items() if name != taken)
-        answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient."
-        answer += f" From {BATCH} rollouts it is {percent(off)} off, {others}{self._needed(taken, row)}."
+        answer = f"Take {ESTIMATES[taken]}: {sure}; {BATCH * self.result.seconds:.2g} s a gradient of {BATCH} rollouts."
+        answer += f" It is {percent(off)} off, {others}{self._needed(taken, row)}."
         later = []
         for label, other, is_off in list(zip(self.labels, best, self.result.too_stiff, strict=True))[row + 1 :]:
             if not is_off and other != taken:
@@ -310,7 +310,7 @@ class Sweep(Paged):
         left = (_NEAR * truth) ** 2 - max((off * truth) ** 2 - variance / BATCH, 0.0)  # for scatter, beside the bias
         if left <= 0:
             return "; more rollouts do not mend its bias"
-        return f"; it is {percent(_NEAR)} off from about {format_number(float(f'{variance / left:.1g}'))}"
+        return f"; it is {percent(_NEAR)} off from about {format_number(float(f'{variance / left:.1g}'))} rollouts"
 
     def __str__(self) -> str:
         errors = "\n".join([_ERRORS, *aligned(self._rows(), str.ljust)])
@@ -505,12 +505,12 @@ class _Prices:
 
     def foretold(self, num_swept: int, num_samples: int, num_reference: int, horizon: int) -> str:
         """Say what a sweep measures, and what it will take."""
-        what = f"{num_swept} stiffnesses, {num_samples} gradients of {horizon} steps each"
+        what = f"{num_swept} stiffnesses, {num_samples} rollouts of {horizon} steps each"
         first = "compiling first"
         if self.motion is not None and self.gradient is not None:
             whole_price = duration(num_swept * (num_samples * self.gradient + num_reference * self.motion))
             if self.is_quick:
-                what += f": {whole_price}, {BATCH * self.gradient:.2g} s a gradient"
+                what += f": {whole_price}, {BATCH * self.gradient:.2g} s a gradient of {BATCH} rollouts"
             else:  # nobody knows before how long that takes
                 first += (
                     f", a minute or several for a robot; engine mujoco would take {whole_price}, and compiles nothing"

@@ -187,7 +187,7 @@ class StabilityReport(Printed):
         lines += [textwrap.fill(one, _WIDTH, initial_indent="- ", subsequent_indent="  ") for one in sentences]
         return "\n".join(lines)
 
-    __str__ = summary
+    __str__ = __repr__ = summary
 
     def _rows(self) -> Iterator[tuple[str, ...]]:
         groups: dict[tuple[str, ...], list[Spring]] = {}

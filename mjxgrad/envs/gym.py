@@ -43,6 +43,15 @@ class _Adapter:
         self.render_mode, self._view, self._state = render_mode, view, None
         self.metadata = {**self.metadata, "render_fps": round(1 / float(self.environment.interval))}
 
+    def __repr__(self) -> str:
+        is_many = isinstance(self, GymVectorEnv)
+        seen, action = (
+            getattr(self, f"{'single_' * is_many}{kind}_space").shape[0] for kind in ("observation", "action")
+        )
+        copies = f", {self.num_envs} copies" if is_many else ""
+        sizes = f"{seen} observed numbers, {action} action{'s' * (action != 1)}"
+        return f"{type(self).__name__}({self.environment.scene.name}: {sizes}{copies})"
+
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, _Info]:
         super().reset(seed=seed, options=options)
         self._copy_key, self._state = self._begin(jax.random.key(int(self.np_random.integers(2**31))))

@@ -1,14 +1,17 @@
 """Evaluation of a policy in C MuJoCo rather than in the simulator that it was trained in."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from mjxgrad._arrays import function, instance, one_key, one_of, traceable, whole
+from mjxgrad._arrays import function, instance, is_known, one_key, one_of, traceable, whole
 from mjxgrad._programs import compile_once
+from mjxgrad._text import format_number
 from mjxgrad.engines import ENGINES, QUICK
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.stepping import Discrete, EngineName
@@ -30,6 +33,15 @@ class Evaluation(eqx.Module):
     terminated: Bool[Array, "*episodes"]
     qpos: Float[Array, "*episodes states nq"]
     terms: dict[str, Float[Array, "*episodes"]]
+
+    def __repr__(self) -> str:
+        if not all(map(is_known, (self.returns, self.lengths, self.terminated))):
+            return super().__repr__()
+        returns, count = np.asarray(self.returns, float), self.returns.size
+        error = f" ± {format_number(returns.std(ddof=1) / math.sqrt(count))}" if count > 1 else ""
+        length, ended = format_number(float(np.mean(self.lengths))), int(np.sum(self.terminated))
+        told = f"mean return {format_number(returns.mean())}{error}, mean length {length}, {ended} ended early"
+        return f"Evaluation({count} episode{'s' * (count != 1)}: {told})"
 
 
 def evaluate(

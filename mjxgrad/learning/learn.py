@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from mjxgrad._arrays import instance, whole
+from mjxgrad._arrays import instance, is_known, whole
 from mjxgrad._text import Printed, format_range
 from mjxgrad.batched.device import fits
 from mjxgrad.envs import Environment
@@ -56,6 +56,10 @@ class Learned(eqx.Module, Printed):
         agreed = f"halves of the environments agree to {np.nanmean(agreement[late]):.2f}"
         seconds = np.asarray(self.history["seconds"]).reshape(len(reward), -1)[:, 0].sum()
         return f"Reward {rewards} a step in the last of {len(reward)} updates, {seconds:.3g} s; {agreed}."
+
+    def __repr__(self) -> str:
+        is_told = all(is_known(one) and one.ndim for one in self.history.values())
+        return f"Learned({self} {self.policy})" if is_told and self.history else super().__repr__()
 
 
 def learn(

@@ -17,7 +17,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
-from mjxgrad._text import write
+from mjxgrad._arrays import is_known
+from mjxgrad._text import format_number, write
 from mjxgrad.batched import over_devices
 from mjxgrad.envs import Environment, EnvState
 from mjxgrad.learning.mixing import Halves, Products
@@ -46,6 +47,15 @@ class Policy(eqx.Module):
     def __call__(self, obs: Float[Array, " obs"]) -> Float[Array, " nu"]:
         """Return the action, from −1 to 1, without noise."""
         return jnp.tanh(self.actor(self.normaliser(obs)))
+
+    def __repr__(self) -> str:
+        layers, count = self.actor.layers, self.normaliser.count
+        if not all(eqx.is_array_like(one.weight) and jnp.ndim(one.weight) > 1 for one in layers):
+            return super().__repr__()  # a tree of something else, such as axes of vmap
+        sizes = [one.weight.shape[-1] for one in layers] + [layers[-1].weight.shape[-2]]
+        seen = f", {format_number(float(np.max(count)))} observations seen" if is_known(count) else ""
+        several = f", {math.prod(count.shape)} side by side" * bool(count.shape)
+        return f"Policy({' → '.join(map(str, sizes))}{seen}{several})"
 
     @property
     def arrays(self) -> dict[str, Array]:
@@ -204,7 +214,7 @@ class ActorCritic(Method):
 
     def identity(self) -> dict[str, Any]:
         name = type(self.environment).__qualname__
-        return {"settings": repr(self.settings), "environment": name}
+        return {name: repr(value) for name, value in vars(self.settings).items()} | {"environment": name}
 
     def learnt(self, carry: Learner) -> Policy:
         return carry.policy

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from mjxgrad._arrays import is_known
 from mjxgrad._text import Printed, format_number, format_range
 from mjxgrad.estimators import Reason
 from mjxgrad.loop.run import Progress
@@ -184,6 +185,12 @@ class Optimisation(eqx.Module, Printed):
             whose = "The" if len(runs) == 1 else f"In {is_worse.sum()} of {len(runs)} runs the"
             text = f"{whose} last step is clearly worse than the best: take result.best_params. {text}"
         return f"{text}{reasons}{self.history.about_alpha}. {rollouts} rollouts took {spent}."
+
+    def __repr__(self) -> str:
+        is_told = all(
+            map(is_known, jax.tree.leaves((self.best_cost, self.final_cost, self.stopped, self.history.cost)))
+        )
+        return f"Optimisation({self})" if is_told else super().__repr__()
 
     def _at_last(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return each run's last measured cost, its error (NaN without noise), and whether it is clearly above the best."""

@@ -32,8 +32,9 @@ from mjxgrad._text import duration, write
 from mjxgrad.batched.device import all_devices
 
 Log = Callable[[int, dict[str, float]], Any]
-_FORMAT = 4  # of checkpoints
+_FORMAT = 5  # of checkpoints
 _PARTS = {
+    "format": "the version of mjxgrad",
     "program": "a rate or other number, or the code, of environment, objective, estimator or optimiser, or a library's version",
     "arrays": "arrays in environment, objective or method",
     "start": "params or key",
@@ -359,15 +360,22 @@ def _load(path: Path, like: PyTree, fingerprint: dict[str, Any]) -> PyTree:
         if not zipfile.is_zipfile(path):
             raise ValueError("it is no archive of arrays")
         with np.load(path, allow_pickle=False) as archive:
+            if "header" not in archive.files:
+                is_policy = {"weight0", "bias0", "mean", "scale"} <= {*archive.files}
+                raise ValueError("it is a saved policy" if is_policy else "it is no checkpoint")
             header = json.loads(archive["header"].tobytes())
             leaves = [archive[f"leaf{i}"] for i in range(len(archive.files) - 1)]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        got = f"got {path}, but {error}"
         raise ValueError(
-            f"checkpoint must be a file that a run has saved, got {path}, which cannot be read ({error}); "
-            "delete it, or give another path, to begin anew"
+            f"checkpoint must be a file that a run has saved, {got}; give another path to begin anew"
         ) from error
     expected = {"format": _FORMAT, **fingerprint}
     differing = {name: value for name, value in expected.items() if header.get(name) != value}
+    if "format" in differing:  # which has other names
+        differing = {"format": _FORMAT}
+    if differing.keys() - _PARTS.keys():  # with a setting the program changes, and perhaps its arrays
+        differing = {name: value for name, value in differing.items() if name not in ("program", "arrays")}
     if differing:
         changes = [_PARTS.get(name, f"{name} was {header.get(name)} and is {here}") for name, here in differing.items()]
         raise ValueError(

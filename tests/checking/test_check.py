@@ -8,6 +8,7 @@ import threading
 import time
 import types
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -106,6 +107,7 @@ def test_a_time_step_too_long_for_a_contact_is_named(contact, longest):
     assert "10 ms is too long for contact floor – ball" in fault(verdict, "time_step")
     assert 0 < verdict.recommendation.timestep < longest
     assert not kinds(quick(ball(timestep=verdict.recommendation.timestep, contact=contact)))
+    assert repr(verdict.stability) == verdict.stability.summary()
 
 
 def test_an_actuator_without_effect_is_named_and_no_other():
@@ -147,10 +149,26 @@ def test_a_start_that_was_asked_for_is_that_of_motions_and_of_the_code():
     assert verdict.motions.controls.mean() > 0.4
     assert verdict.motions.controls.max() <= 1
     assert "keyframe='near'" in verdict.code
-    assert "key('near').ctrl" in program(verdict, "ball.xml", "ball.mp4")[0]
+    assert "key('near').ctrl" in program(verdict, "ball.xml", Path("ball.py"))[0]
     assert "keyframe='far'" in quick(scene).code
     with pytest.raises(ValueError, match=r"keyframe must be one of \['far', 'near'\]"):
         mg.check(scene, start="between")
+
+
+@pytest.mark.parametrize(
+    ("cost", "kind", "said"),
+    [
+        (lambda motion: motion.qpos[-1, 0] * jnp.nan, "cost_not_finite", "the cost is not finite"),
+        (lambda motion: 1.0, "cost_unfelt", "the cost does not feel the motion"),
+        (lambda motion: jnp.sign(motion.qvel[0, 0]), "cost", "the cost has no derivative"),
+        (lambda motion: jnp.abs(motion.qvel[0, 0]) ** 0.5, "cost", "the cost has no derivative"),
+    ],
+)
+def test_what_is_wrong_with_a_cost_is_said_first(cost, kind, said):
+    """The ball begins at rest, where a sign and a root have no derivative, and another speed has another value."""
+    verdict = quick(ball(), cost)
+    assert kinds(verdict) == {kind}
+    assert verdict.headline.endswith(f"Mind that {said}.")
 
 
 def test_contact_that_never_touches_is_named():
@@ -224,6 +242,36 @@ def test_what_a_budget_leaves_no_time_for_is_named():
     assert len(verdict.headline.split()) <= 25
 
 
+def test_as_many_steps_are_measured_as_were_asked_for_however_slow():
+    """Of 250 that the motions have, in a thousandth of a second, by as few motions as there are for fewer steps."""
+    verdict = mg.check(ball(), horizon=130, budget=1e-3)
+    assert verdict.measured.times[-1] == pytest.approx(130 * 0.002)
+    assert "readings by 8 motions each" in verdict.summary().replace("\n  ", " ")
+    assert verdict.recommendation.horizon == 130
+    assert "horizon=130" in program(verdict, "scene.xml", Path("task.py"))[0]
+    assert mg.check(ball(), horizon=7, derivatives=False).recommendation.horizon == 7
+    for horizon, said in ((3, "at least 4"), (251, "at most 250, the time steps of the random motions")):
+        with pytest.raises(ValueError, match=f"horizon must be {said}"):
+            mg.check(ball(), horizon=horizon)
+
+
+def test_a_body_that_is_touched_later_than_was_measured_is_named_unless_a_cost_tells_what_counts():
+    """One falls a centimetre, within 23 steps, and the other 1 m in 0.45 s, 226 steps, where 40 are measured."""
+    two = """<mujoco><worldbody><geom name="floor" type="plane" size="5 5 .1"/>
+      <body name="near" pos="0 0 .06"><joint type="slide" axis="0 0 1"/><geom size=".05" mass=".1"/></body>
+      <body name="late" pos="1 0 1.05"><joint type="slide" axis="0 0 1"/><geom size=".05" mass="3"/></body>
+      </worldbody></mujoco>"""
+    verdict = mg.check(two, budget=1e-3)
+    told = fault(verdict, "untouched")
+    assert "late is not touched within the 0.08 s that were measured, but after 0.45 s: give --horizon 250" in told
+    assert "Mind that late is not touched." in verdict.headline
+    assert "untouched" not in kinds(mg.check(two, horizon=250, budget=1e-3))
+    assert "untouched" not in kinds(mg.check(two, lambda motion: motion.qpos[-1, 0], budget=1e-3))
+    far = mg.check(two.replace("0 1.05", "0 40"), budget=1e-3)
+    assert "late can be touched, but no random motion does so within 0.5 s" in far.summary().replace("\n  ", " ")
+    assert "untouched" not in kinds(far)
+
+
 @pytest.fixture
 def measuring():
     """From a mover to what is measured of a ball's motions, and to the advice that follows from what was measured."""
@@ -239,7 +287,7 @@ def measuring():
 class OutOfTime(Mover):
     """Motions that take no time, as many as the number of steps, a line and noise need, and for ever the others."""
 
-    def __init__(self, num_moves=2 + 6 + 1):
+    def __init__(self, num_moves=2 + 7 + 1):
         self.size, self.end = 32, time.perf_counter() + 1000
         self._left = num_moves
 
@@ -476,6 +524,7 @@ def test_a_dear_slope_that_is_no_nearer_is_named_and_left():
     assert [nearest((slope, discrete), price) for price in (1.9, 46)] == ["slope", "discrete"]
     told = price_finding({"slope": 4.6, "discrete": 0.1}, (slope, discrete), 40).text
     assert "costs 46 times as much and is no nearer beyond doubt" in told
+    assert told.startswith("A gradient of one rollout of 40 steps takes 4.6 s by ")
 
 
 def test_one_reading_does_not_choose_a_dear_slope():
@@ -486,11 +535,21 @@ def test_one_reading_does_not_choose_a_dear_slope():
     assert "too few to choose by" in told
 
 
+@pytest.mark.parametrize(
+    ("count", "said"), [(0, "too few readings to tell"), (3, "too few readings to tell"), (4, "70 % off by 4 readings")]
+)
+def test_too_few_readings_give_no_percentage_and_no_fault(bounce, count, said):
+    advice = dataclasses.replace(bounce.recommendation, gradient="discrete")
+    found = [Slope(kind, np.full(count, 0.7), 64) for kind in KINDS]
+    assert f" ahead: {said}." in headline([], advice, bounce.motions, found, {})
+    assert findings.slope_finding(found).is_fault == (count == 4)
+
+
 def test_the_answer_comes_first_with_its_sureness_and_its_price(bounce):
     found, fault = slopes(bounce.measured.lines), findings.Finding("jump", "", True)
     told = headline([fault], bounce.recommendation, bounce.motions, found, {"slope": 0.084, "discrete": 0.1})
     assert re.fullmatch(
-        r"Take contact=mg.Slope\(\) and first_order, .* s ahead: .* % off by \d+ readings; 0.084 s a gradient. "
+        r"Take contact=mg.Slope\(\) and first_order, .* s ahead: .* % off by \d+ readings; 0.084 s a gradient of one rollout. "
         "Mind that the outcome jumps.",
         told,
     )
@@ -598,7 +657,7 @@ def test_a_program_of_slow_steps_has_fewer_samples_and_foretells_its_time(bounce
     assert bounce.motions.timestep == 0.002
     for each, num_samples, wanted in [(1e-4, 16, 12.0), (1e-3, 12, 90.0), (1e-2, 4, 300.0)]:
         verdict = dataclasses.replace(bounce, recommendation=advice, seconds={"discrete": each})
-        text, seconds = program(verdict, "scene.xml", "task.mp4")
+        text, seconds = program(verdict, "scene.xml", Path("task.py"))
         assert f"num_samples={num_samples})" in text
         np.testing.assert_allclose(seconds, wanted)
 

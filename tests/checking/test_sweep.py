@@ -113,7 +113,7 @@ def test_the_table_has_the_files_own_contact_and_says_what_the_time_step_does_no
     assert swept.labels == ["1000", "2500 (file)", "1e6"]
     lines = str(swept).splitlines()
     assert lines[0].startswith("block.xml: Take ")
-    assert "s a gradient. From 16 rollouts it is " in lines[0]
+    assert "s a gradient of 16 rollouts. It is " in lines[0]
     assert [line.split("  ")[0] for line in lines if line.startswith(("1000", "2500", "1e6 !"))][-3:] == [
         *swept.labels[:2],
         "1e6 !",
@@ -131,6 +131,8 @@ def test_the_page_has_answer_picture_table_and_sentence(swept):
     assert html.escape(page) in swept._repr_html_()  # a notebook shows it in a frame
     assert page.index("<h1>") < page.index("2500 (file)") < page.index("<svg")
     assert "h²k" in page.partition("</table>")[2]
+    assert "s a gradient of 16 rollouts" in plain
+    assert "Error of a gradient of 16 rollouts" in plain
 
 
 def test_without_matplotlib_page_and_picture_say_what_brings_it(swept, monkeypatch):
@@ -254,17 +256,17 @@ def test_the_answer_names_what_to_take_how_sure_and_from_where_something_else(sw
     np.testing.assert_allclose(swept.errors()["first"], [0.1, 0.1, np.sqrt(0.25 + 0.01 - 1e-4)], rtol=1e-6)
     assert not swept.headline.endswith("on α-order.")  # the time step is too long for 1e6 1/s²
     monkeypatch.setattr(type(swept.result), "too_stiff", [""] * 3)
-    told = re.sub(r"[\d.e-]+ s a gradient", "0.3 s a gradient", swept.headline)
+    told = re.sub(r"[\d.e-]+ s a", "0.3 s a", swept.headline)
     assert told == (
-        "Take first order: its variance is 0.04 of zeroth order's and no bias was seen above 2 %; 0.3 s a gradient. "
-        "From 16 rollouts it is 10 % off, zeroth order 50 %, α-order 25 %. From 1e6 1/s² on α-order."
+        "Take first order: its variance is 0.04 of zeroth order's and no bias was seen above 2 %; "
+        "0.3 s a gradient of 16 rollouts. It is 10 % off, zeroth order 50 %, α-order 25 %. From 1e6 1/s² on α-order."
     )
     table["first_bias"][1] = table["first_bias_low"][1] = table["first_bias_high"][1] = 2.0
     table["alpha_order_variance"][:] = 100.0
     assert swept.headline.startswith("Take zeroth order: it has no bias; ")
-    assert " it is 50 % off, first order 200 %, α-order 250 %." in swept.headline
+    assert " It is 50 % off, first order 200 %, α-order 250 %." in swept.headline
     table["zeroth_variance"][:], table["alpha_order_variance"][:] = 64.0, 1e3
-    assert "; it is 50 % off from about 300." in swept.headline  # 64 / 0.5² is 256
+    assert "; it is 50 % off from about 300 rollouts." in swept.headline  # 64 / 0.5² is 256
     for name in halves:
         table[f"{name}_variance"] = np.array([[4.0], [1e5], [4.0]])
     assert swept.headline == (
@@ -296,7 +298,11 @@ def test_a_gradient_that_is_not_told_from_zero_is_said_before_the_sweep(folder):
     still = mg.load_scene(BLOCK.replace('ctrl=".5"', 'ctrl="0"').replace('qvel=".5"', 'qvel="0"'), engine="mujoco")
     quick = {"horizon": 5, "num_samples": 4, "num_reference": 8, "stiffness": [1e3]}
     mg.sweep(still, lambda t: t.qvel[-1, 0] ** 2, log=said.append, **quick)
-    first = next(k for k, line in enumerate(said) if "gradients of 5 steps" in line)
+    first = next(
+        k
+        for k, line in enumerate(said)
+        if "4 rollouts of 5 steps each: " in line and " s a gradient of 16 rollouts, by " in line
+    )
     assert any(line.endswith(told) for line in said[:first]), said
     said.clear()
     mg.sweep(still, lambda t: t.qvel[-1, 0], log=said.append, **quick)

@@ -72,6 +72,12 @@ def test_gymnasiums_check_passes(one):
         check_env(one, skip_render_check=True)
 
 
+def test_it_is_shown_by_its_scene_and_its_sizes(one, many):
+    """Where the cart is, sine and cosine of the pole, and two speeds."""
+    assert repr(one) == "GymEnv(cartpole.xml: 5 observed numbers, 1 action)"
+    assert repr(many) == "GymVectorEnv(cartpole.xml: 5 observed numbers, 1 action, 3 copies)"
+
+
 def test_one_copy_steps_as_the_environment(one, cart):
     """The state can be told from what is seen."""
     obs, _ = one.reset(seed=4)

@@ -61,8 +61,16 @@ def test_an_interrupted_run_goes_on_to_the_bit(cartpole, key, tmp_path):
     np.testing.assert_array_equal(longer.history["reward"][:2], whole.history["reward"])
     assert int(longer.learner.num_updates) == 3
     other = dataclasses.replace(SMALL, discount=0.9)
-    with pytest.raises(ValueError, match=r"of the same run, got .* settings was Counted"):
+    with pytest.raises(
+        ValueError, match=r"of the same run, got .* settings: discount was .* and is 0.9; use the settings"
+    ):
         learning.learn(cartpole, key, num_updates=2, settings=other, checkpoint=tmp_path / "run")
+    whole.policy.save(tmp_path / "policy.npz")
+    with pytest.raises(ValueError, match=r"but it is a saved policy; give another path to begin anew$"):
+        learn(checkpoint=tmp_path / "policy.npz")
+    reward = float(whole.history["reward"][-1])
+    assert repr(whole).startswith(f"Learned(Reward {reward:.4g} a step in the last of 2 updates, ")
+    assert repr(whole).endswith(f". {whole.policy})")
 
 
 def _judged_by(reward):
@@ -160,6 +168,16 @@ class Falls(CartPole):
 
     def is_over(self, state):
         return state.qpos[1] > 2.0
+
+
+def test_an_evaluation_is_shown_by_its_mean_return_with_its_error():
+    """Of 1, 2, 3 and 6: the mean is 3, the variance 14/3, and the error its root over 2, 1.08."""
+    lengths, ended = jnp.array([5, 5, 5, 9]), jnp.array([True, True, False, False])
+    found = learning.Evaluation(jnp.array([1.0, 2.0, 3.0, 6.0]), lengths, ended, jnp.zeros((4, 10, 1)), {})
+    assert repr(found) == "Evaluation(4 episodes: mean return 3 ± 1.08, mean length 6, 2 ended early)"
+    one = jax.tree.map(lambda x: x[:1], found)
+    assert repr(one) == "Evaluation(1 episode: mean return 1, mean length 5, 1 ended early)"
+    assert "returns=" in repr(jax.eval_shape(lambda: found)), "shapes have no mean"
 
 
 def test_an_evaluation_ends_with_the_episode(cartpole, key):

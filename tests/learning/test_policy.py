@@ -44,6 +44,17 @@ def test_numpy_runs_a_saved_policy(policy, tmp_path):
         np.testing.assert_allclose(act(obs), policy(jnp.asarray(obs)), atol=1e-6)
 
 
+def test_a_policy_is_shown_by_its_sizes_and_what_it_has_seen(policy):
+    """Six numbers in, three actions out; in a trace what it has seen is not known, and a tree of axes is no policy."""
+    assert repr(policy) == "Policy(6 → 32 → 16 → 3, 50 observations seen)"
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), policy)
+    assert repr(both) == "Policy(6 → 32 → 16 → 3, 50 observations seen, 2 side by side)"
+    told = []
+    jax.eval_shape(lambda traced: told.append(repr(traced)), policy)
+    assert told == ["Policy(6 → 32 → 16 → 3)"]
+    assert "Network(" in repr(jax.tree.map(lambda _: 0, policy))
+
+
 def test_several_policies_are_not_one_file(policy, tmp_path):
     both = jax.tree.map(lambda x: jnp.stack([x, x]), policy)
     with pytest.raises(ValueError, match="policy must be one, got several"):

@@ -130,6 +130,9 @@ def test_a_step_that_is_not_finite_changes_nothing_but_its_count(key):
 def test_a_result_is_shown_as_a_sentence(zeroth_order_run):
     """By `print`, and by IPython as a notebook does."""
     assert pretty(zeroth_order_run) == str(zeroth_order_run)
+    assert repr(zeroth_order_run) == f"Optimisation({zeroth_order_run})"
+    shapes = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, zeroth_order_run))
+    assert "best_cost=" in repr(shapes), "shapes have no numbers"
     best, last = (float(x) for x in (zeroth_order_run.best_cost, zeroth_order_run.final_cost))
     costs = f"Best cost {best:.4g} (best_params), at the last step {last:.4g} (params)"
     assert f"{costs}, after 250 steps, 0 skipped: all steps were done" in str(zeroth_order_run)
