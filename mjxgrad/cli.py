@@ -257,6 +257,8 @@ def identify(
     files, page, search = (importlib.import_module(f"mjxgrad.identification.{name}") for name in parts)
     if not recordings:
         raise CommandError("identify needs a recording: mjxgrad identify scene.xml motion.csv --parameter mass:torso")
+    if max_steps < 1:
+        raise CommandError(f"--max-steps must be at least 1, got {max_steps}")
     if len({os.path.realpath(path) for path in recordings}) < len(recordings):
         raise CommandError(f"each recording must be named once, got {' '.join(recordings)}")
     with warnings.catch_warnings(record=True) as told:

@@ -160,11 +160,11 @@ class LeastRisk(eqx.Module):
     Two sources tell $b^2$, and the smaller counts:
 
     - $D = \|g^1 - g^0\|^2$ less its noise is unbiased for it. What noise alone exceeds with the probability $2 v^{1/2}$, or
-      $4.5 v^{2/3}$ where that is less, is taken off, $v$ being $V^1/V^0$ as a rule. A bias that is not there costs $V^0$, one
-      that is there, unseen, as much as is taken off. By this balance the largest ratio to the better part's error, over all
-      biases, is near the least that any rule of both means can have. This is near 1 where noise is worth 16 coordinates or
-      more, but in a single one it is 1.9 where $v$ is a tenth, 3.4 at a hundredth, 7.4 at $10^{-4}$: there nobody can promise
-      more.
+      $4.5 v^{2/3}$ where that is less, is taken off, $v$ being $V^1/V^0$ as a rule. A bias that is seen where there is none
+      costs $V^0$, and one that is not seen as much as is taken off. By this balance the largest ratio to the better part's
+      error, over all biases, is near the least that any rule of both means can have. This is near 1 where noise is worth 16
+      coordinates or more, but in a single one it is 1.9 where $v$ is a tenth, 3.4 at a hundredth, 7.4 at $10^{-4}$: there
+      nobody can promise more.
     - $U$, by what derivatives leave unexplained in the costs, bounds it from above (see `SecantSums`). It is zero for a
       quadratic. Where samples are fewer than dimensions, it lies below $V^0$: no bias does more harm there than the noise of
       zeroth order.
