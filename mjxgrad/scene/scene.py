@@ -79,7 +79,8 @@ class Scene(eqx.Module):
     Attributes:
         model: model for MJX; its array leaves may be differentiated, replaced and batched.
         data: template at `qpos0`; no stage of the dynamics has run.
-        mj_model: the C model of the same motion, for rendering and names, with the file's numbers; see `to_mujoco`.
+        mj_model: the C model of the same motion, for rendering and names, with the file's numbers; see `to_mujoco`. It is to be
+            read only: engines keep copies.
         omissions: parts that a step leaves out, and why.
         conversions: settings replaced by others, and why.
         pairs: geom pairs that can touch, the first 20,000, in the order of `contact_parameters`; `summary` groups equal ones.
