@@ -300,7 +300,7 @@ def test_parameters_may_be_set_one_after_the_other():
             (lambda scene, body, x: scene.with_parameters(by(body), x)) if one_by_one else lambda s, b, x: by(b)(s, x)
         )
         changed = step(step(step(scene, 1, numbers[0]), 2, numbers[1]), 1, numbers[2])
-        found = mg.rollout(changed, mg.initial_state(changed, qvel=jnp.array([0.0, 1.0])), horizon=100)
+        found = mg.rollout(changed, mg.initial_state(changed, qvel=jnp.array([0.0, 1.0])), horizon=10)
         return found.qpos[-1] @ jnp.array([1.0, 2.0])
 
     numbers = jnp.array([1.1, 0.9, 1.3])
