@@ -196,7 +196,7 @@ def _advance(
     rows[..., layout.motion] = flight.ends[motions, slots]
     # Pairs of a motion follow each other.
     first = np.flatnonzero(np.diff(motions, prepend=-1))
-    counts = np.diff([*first, len(motions)]).tolist()
+    counts = np.diff(first, append=len(motions)).tolist()
     models = [
         model for i, n in zip(first, counts, strict=True) for model in 2 * n * [course.models(int(motions[i]), t)]
     ]
