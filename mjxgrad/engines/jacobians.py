@@ -468,7 +468,7 @@ class Worker:
         """Write small differences of sensors by state, controls, other inputs and numbers."""
         # `mjd_transitionFD` of MuJoCo 3.17, centred, gives those by controls the wrong sign.
         model, layout, place = self.inverse.model, self.layout, self.layout.places["ctrl"]
-        self._read(row)
+        middle = self._read(row)
         # What needs fewer stages comes first, while those of the row are known.
         for column in range(model.nu if "ctrl" in found and self.sensed is None else 0):
             own, ends = slice(column, column + 1), []
@@ -487,7 +487,6 @@ class Worker:
             above, below = (self._read(start, done) for start in starts[column])
             found["state"][:, column] = (above - below) / (2 * WIDTH)
         for name in (one for one in found if is_other(one)):
-            middle = self._read(row)
             for column, (put, size, is_zero) in enumerate(self._changes(self.inverse, row, name)):
                 read = lambda amount, put=put: self._read(put(amount))  # noqa: E731
                 found[name][:, column] = _derivative(read, middle, size, is_zero)

@@ -210,18 +210,17 @@ class Scene(eqx.Module):
         model = self.mj_model
         # Of such bodies MuJoCo keeps the diagonal of the inertia matrix alone.
         simple = np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 1))
-        for name in ("body_ipos", "body_iquat", "jnt_axis"):
-            is_of = np.isin(model.jnt_bodyid, simple) if name == "jnt_axis" else np.isin(np.arange(model.nbody), simple)
-            if name not in changed or not is_of.any():
-                continue
-            told = (
-                f"{name} of {model.body(simple[0]).name or f'body {simple[0]}'}, whose inertia was compiled as diagonal"
-            )
-            remedy = "move its centre of mass in the file, by as little as <inertial pos='1e-6 0 0' .../>"
-            if name not in known:
+        for name in changed.keys() & {"body_ipos", "body_iquat", "jnt_axis"}:
+            owners = model.jnt_bodyid if name == "jnt_axis" else np.arange(model.nbody)
+            is_of = np.isin(owners, simple)
+            if name in known:
+                is_of &= (np.abs(known[name] - getattr(model, name)) > _ROUNDING).any(axis=1)
+            for body in owners[is_of][:1].tolist():
+                told = f"{name} of {model.body(body).name or f'body {body}'}, whose inertia was compiled as diagonal"
+                remedy = "move its centre of mass in the file, by as little as <inertial pos='1e-6 0 0' .../>"
+                if name in known:
+                    raise ValueError(f"{told}, cannot change: {remedy}")
                 _warn(self, f"{told}, has no effect on it: {remedy}")
-            elif not np.allclose(known[name][is_of], getattr(model, name)[is_of], rtol=0, atol=_ROUNDING):
-                raise ValueError(f"{told}, cannot change: {remedy}")
         if self.engine != "mjx":
             return
         for name, has in (

@@ -246,6 +246,10 @@ def test_what_was_left_out_of_a_model_cannot_change():
     with pytest.warns(SceneWarning, match="body_ipos of box, whose inertia was compiled as diagonal, has no effect"):
         jax.eval_shape(lambda x: scene.with_model(body_ipos=x), moved)
     scene.with_model(body_ipos=scene.model.body_ipos.at[2, 0].set(0.05))
+    ball = '<body name="ball"><freejoint/><geom size=".1"/></body>'
+    two = mg.load_scene(BOX.format(joint="<freejoint/>").replace("<body><joint", f"{ball}<body><joint"))
+    with pytest.raises(ValueError, match="body_ipos of ball, whose"):
+        two.with_model(body_ipos=two.model.body_ipos.at[2, 0].set(0.05))
     slides = mg.load_scene(BOX.format(joint='<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'))
     with pytest.raises(ValueError, match="jnt_axis of box"):
         slides.with_model(jnt_axis=slides.model.jnt_axis.at[1, 0].set(1.0))
